@@ -25,7 +25,7 @@ from gmmtorch.mapping.codec.quantization import spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.merging import all_origins
-from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule
+from gmmtorch.team.exploration.mission.options import FrameRule
 from gmmtorch.team.sharing.messages.component_messages import encode_components, encode_counts
 from gmmtorch.team.sharing.messages.datagrams import CODECS, pose_of
 from gmmtorch.team.sharing.messages.message_registry import decode

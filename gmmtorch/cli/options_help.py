@@ -66,6 +66,10 @@ _REPLACED = {
     "stream.checkpoint_every": "use checkpoint_seconds; else every ten iterations have one.",
     "stream.sample_points": "the start of EM and PSNR2 take 100,000 points.",
     "stream.timeout": "processes wait for each other for ten minutes.",
+    "codec": _CONSTANT
+    % "`TeamOptions.codec`, which a variant of a study may set; team=gmm_thesis has its own",
+    "rounds": "there are always three.",
+    "planner.rest": _CONSTANT % "`TeamOptions.rest`",
     "planner.beams": _CONSTANT % "`TeamOptions.n_beams`",
     "planner.prior": _CONSTANT % "`TeamOptions.planning_prior`, which a variant of a study may set",
 }
@@ -94,12 +98,12 @@ _REPLACED_GROUPS = (
     ),
     (
         "robot.",
-        "speed climb yaw_rate acceleration yaw_acceleration duration step",
+        "radius speed climb yaw_rate acceleration yaw_acceleration duration step",
         _CONSTANT % "`Dynamics` has it",
     ),
     (
         "sensor.",
-        "horizontal_fov vertical_fov noise dropout max_gap deskew",
+        "horizontal_fov vertical_fov max_range noise dropout max_gap deskew",
         _CONSTANT % "`DepthCamera` or `LiveOptions` has it",
     ),
     (

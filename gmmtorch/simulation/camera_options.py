@@ -17,6 +17,7 @@ class CameraOptions:
     """What a depth camera sees.
 
     horizontal_fov, vertical_fov: angles (rad) between opposite edges of the image, below π.
+    max_range: surfaces at this distance (m) along a beam, or beyond, give no return.
     noise: a depth of z metres along the optical axis has standard deviation noise · z² metres.
     dropout: share of the pixels without a reading.
 
@@ -27,7 +28,7 @@ class CameraOptions:
     height: int = option(120, "pixels along a column")
     horizontal_fov: float = 1.5184
     vertical_fov: float = 1.0123
-    max_range: float = option(6.0, "surfaces at this distance (m) along a beam, or beyond, give no return")
+    max_range: float = 6.0
     noise: float = 0.0015
     dropout: float = 0.01
 

@@ -117,15 +117,14 @@ def test_every_experiment_of_teams_composes_and_gives_its_trials(name, tmp_path)
 
 
 def test_the_file_of_the_thesis_team_has_its_options():
-    config = composed("explore", "team=gmm_thesis")
-    assert config.codec == THESIS["codec"]
     plain = from_options.team_options(composed("explore"), 0, {"team": "gmm_thesis"})
-    assert from_options.team_options(config, 0, {}) == plain
+    assert plain.codec == THESIS["codec"]
+    assert from_options.team_options(composed("explore", "team=gmm_thesis"), 0, {}) == plain
 
 
 def test_options_that_are_not_of_the_thesis_team_are_refused():
     with pytest.raises(InvalidArgumentError, match=r"team=gmm_thesis with codec=float.* has thesis"):
-        from_options.team_options(composed("explore", "team=gmm_thesis", "codec=float"), 0, {})
+        from_options.team_options(composed("explore", "team=gmm_thesis"), 0, {"codec": "float"})
     with pytest.raises(InvalidArgumentError, match="team=gmm_thesis sets options of all teams"):
         from_options.variants_of(composed("explore", "team=gmm_thesis", "experiment=deviations"))
 

@@ -14,9 +14,8 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
-from gmmtorch.team.exploration.mission.options import THESIS
-from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
-from gmmtorch.team.exploration.robot.mapper import Memo
+from gmmtorch.team.exploration.mission.options import THESIS, FrameRule, TeamOptions
+from gmmtorch.team.exploration.robot.mapper import GmmMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.sharing.broadcast import Broadcast
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, CountsMessage
@@ -53,9 +52,9 @@ def mapper(
     local = RollingWindow(0.2, (64, 64, 32))
     local.center_on(torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
-    rule, memo = replace(FrameRule(), **options), Memo(256) if memo is None else memo
     shared = Replica(robot, dim=3, incarnation=0) if codec == "replica" else Broadcast(robot, codec)
-    return GmmMapper(local, belief, CAMERA.width, novelty, rule, memo, shared)
+    team = TeamOptions(camera=CAMERA, novelty=novelty, frame=FrameRule(**options))
+    return GmmMapper(local, belief, team, Memo(256) if memo is None else memo, shared)
 
 
 def thesis_mapper(robot: int = 0) -> GmmMapper:

@@ -7,8 +7,13 @@ from torch import Tensor
 
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
+from gmmtorch.team.exploration.robot.component_rays import RayRule, component_evidence
 
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
+
+
+def evidence_of(components: Components, resolution: float, box: Box, **options) -> CellEvidence:
+    return component_evidence(components, box, RayRule(resolution, **options))
 
 
 def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, sequence=0) -> Components:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -19,9 +20,7 @@ from gmmtorch.errors import DataError
 from gmmtorch.occupancy.voxels.cells import CellEvidence
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.team.exploration.planning.journeys import Roadmap
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
 from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
@@ -32,7 +31,6 @@ from gmmtorch.team.sharing.messages.component_messages import encode_components
 from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan, quantized_poses
 from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.view_library import ViewLibrary
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
 LAUNCH = InitialFreeSpace(cells_in_sphere(START[:3], 1.4, 0.2), START[None, :3])
@@ -74,10 +72,8 @@ def agent(number: int = 0, kind: str = "replica", **options: Any) -> tuple[Agent
     team = TeamOptions(framework=framework, size=3, camera=CAMERA, window=(40, 40, 20), **options)
     made: Mapper = mapper(number, "replica" if kind.startswith("grid") else kind)
     if kind.startswith("grid"):
-        local, belief = made.local, made.belief
-        made = GridMapper(number, local, belief, CAMERA.width, NOVELTY, Memo(64), team.shares, team.size)
-    library = ViewLibrary(number, incarnation=0)
-    robot = Robot(number, START, made, Ahead(), library, Roadmap(), LAUNCH, StoppingRule())
+        made = GridMapper(number, made.local, made.belief, replace(team, novelty=NOVELTY), Memo(64))
+    robot = Robot(number, START, made, Ahead(), LAUNCH, StoppingRule())
     post = Post()
     return Agent(robot, post, EVALUATOR, PRIMITIVES, team, Memo(256), Stopwatch()), post
 

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.team.exploration.planning.collision_checking import (
+    LocalMap,
+    PeerTrajectories,
     cells_in_sphere,
     feasible,
     inflated,
     local_map_of,
 )
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 LIBRARY = Primitives(Dynamics())
 RADIUS, CELL = 0.3, 0.2

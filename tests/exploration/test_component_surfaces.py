@@ -7,14 +7,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exploration.ray_cases import EVERYTHING, dense, one
+from exploration.ray_cases import EVERYTHING, dense, evidence_of, one
 from mapping.random_components import normal_components
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cells import Box, sum_evidence
-from gmmtorch.team.exploration.robot.component_rays import component_evidence
 
 RESOLUTION = 0.2
 
@@ -75,8 +73,8 @@ VIEWS = {
 )
 def test_no_cell_that_a_surface_cuts_is_freed(view: str, shell: float) -> None:
     component, unit, offset = sheet(*VIEWS[view])
-    plain = dense(component_evidence(component, RESOLUTION, AROUND), AROUND)
-    found = dense(component_evidence(component, RESOLUTION, AROUND, shell=shell), AROUND)
+    plain = dense(evidence_of(component, RESOLUTION, AROUND), AROUND)
+    found = dense(evidence_of(component, RESOLUTION, AROUND, shell=shell), AROUND)
     nearest, farthest = distances(unit, offset)
     assert torch.equal(found[0], plain[0])
     assert bool((found[1] <= plain[1] + 1e-4).all())
@@ -90,28 +88,17 @@ def test_no_cell_that_a_surface_cuts_is_freed(view: str, shell: float) -> None:
     torch.testing.assert_close(found[1][beyond], plain[1][beyond], rtol=1e-6, atol=1e-4)
 
 
-@pytest.mark.parametrize("view", ["frontal", "grazing"])
-def test_all_cells_along_a_lattice_aligned_surface_are_kept(view: str) -> None:
-    component, unit, offset = sheet(*VIEWS[view])
-    nearest, _ = distances(unit, offset)
-    plain = dense(component_evidence(component, RESOLUTION, AROUND), AROUND)
-    found = dense(component_evidence(component, RESOLUTION, AROUND, shell=1.0), AROUND)
-    cut = nearest == 0
-    assert float(found[1][cut].sum()) == 0
-    assert (float(plain[1][cut].sum()) > 100) == (view == "grazing")
-
-
 def test_no_return_components_have_no_shell() -> None:
     component, _, _ = sheet(*VIEWS["tilted"])
     empty = replace(component, max_range=torch.tensor([True]))
-    one, other = (component_evidence(empty, RESOLUTION, AROUND, shell=shell) for shell in (0.0, 3.0))
+    one, other = (evidence_of(empty, RESOLUTION, AROUND, shell=shell) for shell in (0.0, 3.0))
     for a, b in zip(one, other, strict=True):
         assert torch.equal(a, b)
 
 
 def test_a_sensor_within_the_shell_frees_no_cells() -> None:
     component, _, _ = sheet((0.0, 0.0, 1.0), (2.0, 0.5, 0.55))  # half a cell above the plane
-    evidence = component_evidence(component, RESOLUTION, AROUND, shell=1.0)
+    evidence = evidence_of(component, RESOLUTION, AROUND, shell=1.0)
     assert float(evidence.misses.sum()) == 0
     assert float(evidence.hits.sum()) == pytest.approx(1000.0)
 
@@ -123,7 +110,7 @@ def test_a_sensor_within_the_shell_frees_no_cells() -> None:
 def test_hits_per_ray_does_not_change_the_misses(shell: float) -> None:
     components = normal_components(25, 3, seed=2, empty=0.3)
     once, often = (
-        component_evidence(components, RESOLUTION, EVERYTHING, shell=shell, hits_per_ray=n) for n in (1, 8)
+        evidence_of(components, RESOLUTION, EVERYTHING, shell=shell, hits_per_ray=n) for n in (1, 8)
     )
     missed = [dict(zip(map(tuple, e.cells.tolist()), e.misses.tolist(), strict=True)) for e in (once, often)]
     for cell in missed[0].keys() | missed[1].keys():
@@ -136,9 +123,9 @@ def test_denser_hits_are_more_accurate() -> None:
     for number in range(6):
         component, _, _ = sheet(*VIEWS["tilted"])
         component = replace(component, ids=torch.tensor([[1, number]]))
-        limit = dense(component_evidence(component, RESOLUTION, near, least=50_000, most=50_000), near)[0]
+        limit = dense(evidence_of(component, RESOLUTION, near, least=50_000, most=50_000), near)[0]
         for n in errors:
-            hits = dense(component_evidence(component, RESOLUTION, near, hits_per_ray=n), near)[0]
+            hits = dense(evidence_of(component, RESOLUTION, near, hits_per_ray=n), near)[0]
             errors[n] += float((hits - limit).abs().sum()) / 6
     assert 0 < errors[8] < 0.5 * errors[1]
 
@@ -152,7 +139,7 @@ def test_thinned_rays_have_the_same_expected_misses(view: str, empty: bool) -> N
     component = replace(component, max_range=torch.tensor([empty]))
     options = {"least": 20_000, "most": 20_000, "shell": 1.0}
     limit, found = (
-        dense(component_evidence(component, RESOLUTION, AROUND, **options, thinned=thinned), AROUND)
+        dense(evidence_of(component, RESOLUTION, AROUND, **options, thinned=thinned), AROUND)
         for thinned in (False, True)
     )
     assert torch.equal(found[0], limit[0])
@@ -166,7 +153,7 @@ def test_all_rays_count_as_misses_in_the_cell_of_the_sensor() -> None:
     component, _, _ = sheet(*VIEWS["tilted"])
     for least in range(1, 10):
         plain, thinned = (
-            component_evidence(component, RESOLUTION, AROUND, least=least, most=least, thinned=thinned)
+            evidence_of(component, RESOLUTION, AROUND, least=least, most=least, thinned=thinned)
             for thinned in (False, True)
         )
         if least == 1:
@@ -186,21 +173,9 @@ def test_evidence_of_disjoint_boxes_sums_to_the_whole(shell: float, thinned: boo
     for octant in itertools.product((0, 1), repeat=3):
         low = torch.tensor([(-12, 3)[side] for side in octant])
         high = torch.tensor([(3, 12)[side] for side in octant])
-        halves.append(component_evidence(components, RESOLUTION, Box(low, high), **options))
-    expected = component_evidence(components, RESOLUTION, whole, **options)
+        halves.append(evidence_of(components, RESOLUTION, Box(low, high), **options))
+    expected = evidence_of(components, RESOLUTION, whole, **options)
     assert float(expected.hits.sum()) > 10
     torch.testing.assert_close(
         dense(sum_evidence(halves), whole), dense(expected, whole), rtol=1e-5, atol=1e-4
     )
-
-
-def test_invalid_arguments_are_refused() -> None:
-    component, _, _ = sheet(*VIEWS["frontal"])
-    for options, message in (
-        ({"shell": -0.1}, "shell=-0.1"),
-        ({"shell": float("nan")}, "shell=nan"),
-        ({"shell": float("inf")}, "shell=inf"),
-        ({"hits_per_ray": 0}, "hits_per_ray=0"),
-    ):
-        with pytest.raises(InvalidArgumentError, match=message):
-            component_evidence(component, RESOLUTION, AROUND, **options)

@@ -16,25 +16,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.mission.mission import plan_together
+from gmmtorch.team.exploration.mission.mission import COORDINATIONS, coordinate, plan_together
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.planning.coordination import (
-    COORDINATIONS,
-    Coordination,
-    PeerTrajectories,
-    clear_of,
-    predicted_path,
-)
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, clear_of, predicted_path
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""
-
-
-def coordinate(name, robots, plan, generator, n_rounds=3):
-    """The plans of a team by the rule of that name."""
-    return Coordination(name, n_rounds).coordinate(robots, plan, generator)
 
 
 @dataclass(frozen=True)
@@ -72,7 +61,7 @@ teams = st.lists(
 @given(choices=teams, name=st.sampled_from(COORDINATIONS), seed=st.integers(0, 99), n=st.integers(1, 5))
 def test_each_robot_gets_one_feasible_plan(choices, name, seed, n):
     plan, _ = planner_of(choices)
-    plans = coordinate(name, range(len(choices)), plan, torch.Generator().manual_seed(seed), n)
+    plans = coordinate(name, len(choices), plan, torch.Generator().manual_seed(seed), n)
     assert sorted(plans) == list(range(len(choices)))
     assert all(cover.cells in choices[robot] for robot, cover in plans.items())
 
@@ -82,7 +71,7 @@ def test_greedy_covers_at_least_half_of_the_optimum(choices, n):
     generator = torch.Generator().manual_seed(0)
     for name, rounds in (("greedy", 1), ("distributed_greedy", len(choices) + n)):
         plan, _ = planner_of(choices)
-        plans = coordinate(name, range(len(choices)), plan, generator, rounds)
+        plans = coordinate(name, len(choices), plan, generator, rounds)
         assert 2 * covered(plans) >= optimum(choices)
 
 
@@ -96,7 +85,7 @@ def test_distributed_greedy_with_a_round_for_each_takes_the_best_gain_first(choi
         robot = max(sorted(gains), key=lambda r: gains[r])
         taken |= max(left.pop(robot), key=lambda cells: len(cells - taken))
         expected.append(robot)
-    plans = coordinate("distributed_greedy", range(len(choices)), plan, torch.Generator(), len(choices))
+    plans = coordinate("distributed_greedy", len(choices), plan, torch.Generator(), len(choices))
     assert list(plans) == expected
     assert covered(plans) == len(taken)
 
@@ -104,39 +93,26 @@ def test_distributed_greedy_with_a_round_for_each_takes_the_best_gain_first(choi
 def test_coordination_passes_the_right_plans():
     choices: Choices = [[frozenset({robot})] for robot in range(4)]
     plan, asked = planner_of(choices)
-    coordinate("greedy", range(4), plan, torch.Generator())
+    coordinate("greedy", 4, plan, torch.Generator())
     assert asked == [(0, ()), (1, (0,)), (2, (0, 1)), (3, (0, 1, 2))]
     plan, asked = planner_of(choices)
-    coordinate("myopic", range(4), plan, torch.Generator())
+    coordinate("myopic", 4, plan, torch.Generator())
     assert asked == [(robot, ()) for robot in range(4)]
     plan, asked = planner_of(choices)
-    coordinate("distributed_greedy", range(4), plan, torch.Generator(), 2)
+    coordinate("distributed_greedy", 4, plan, torch.Generator(), 2)
     assert asked == [*((robot, ()) for robot in range(4)), (2, (0, 1)), (3, (0, 1))]
 
 
 @given(seed=st.integers(0, 200), n_rounds=st.integers(1, 4))
 def test_random_partition_considers_all_earlier_rounds(seed, n_rounds):
     choices: Choices = [[frozenset({robot})] for robot in range(6)]
-    rule = Coordination("random_partition", n_rounds)
-    rounds = rule.rounds(6, torch.Generator().manual_seed(seed))
-    assert sorted(itertools.chain(*rounds)) == list(range(6))
-    assert len(rounds) <= n_rounds
-    assert all(rounds)
+    drawn = torch.randint(n_rounds, (6,), generator=torch.Generator().manual_seed(seed)).tolist()
     plan, asked = planner_of(choices)
-    rule.coordinate(range(6), plan, torch.Generator().manual_seed(seed))
-    before: list[int] = []
-    expected = []
-    for robots in rounds:
-        expected += [(robot, tuple(sorted(before))) for robot in robots]
-        before += robots
-    assert asked == expected
-
-
-def test_bad_input_is_named():
-    with pytest.raises(InvalidArgumentError, match="coordination='chaos'"):
-        Coordination("chaos")
-    with pytest.raises(InvalidArgumentError, match="n_rounds=0"):
-        Coordination("greedy", 0)
+    coordinate("random_partition", 6, plan, torch.Generator().manual_seed(seed), n_rounds)
+    order = sorted(range(6), key=lambda robot: drawn[robot])
+    assert asked == [
+        (robot, tuple(other for other in range(6) if drawn[other] < drawn[robot])) for robot in order
+    ]
 
 
 # -- paths of peers ---------------------------------------------------------------------------------
@@ -310,7 +286,7 @@ def taken(
     drawn = torch.rand(N, 3, generator=torch.Generator().manual_seed(seed)).tolist()
     agents: list[Any] = [Recorder(number, log, values) for number, values in enumerate(drawn)]
     generator = torch.Generator().manual_seed(seed)
-    plans = plan_together(agents, Coordination(name, 3), options, NOW, NUMBER, generator)
+    plans = plan_together(agents, name, options, NOW, NUMBER, generator)
     return agents, log, plans
 
 

@@ -12,6 +12,7 @@ from exploration.voxel_worlds import RESOLUTION, surroundings_from
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.journeys import (
     DistanceField,
     Roadmap,
@@ -19,7 +20,6 @@ from gmmtorch.team.exploration.planning.journeys import (
     coarsened,
     geodesic,
 )
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 STEPS = [step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)]
 
@@ -40,11 +40,6 @@ def by_dijkstra(open_cells: torch.Tensor, starts: dict[tuple[int, ...], float]) 
             if inside and open_cells[other]:
                 heapq.heappush(heap, (width + math.hypot(*step), other))
     return found
-
-
-def local_map(passable: torch.Tensor, low: tuple[int, int, int] = (0, 0, 0)) -> LocalMap:
-    known = torch.ones_like(passable)
-    return LocalMap(torch.tensor(low), 0.2, known.float(), known, passable, passable)
 
 
 @given(
@@ -92,7 +87,7 @@ def test_coarsened_keeps_narrow_passages_and_thick_walls():
 @given(seed=st.integers(0, 200))
 def test_geodesic_is_close_to_euclidean_in_open_space(seed):
     generator = torch.Generator().manual_seed(seed)
-    here = local_map(torch.ones(20, 16, 10, dtype=torch.bool), low=(7, -3, 2))
+    here = surroundings_from(torch.ones(20, 16, 10, dtype=torch.bool), low=(7, -3, 2))
     corner = here.low.double() * 0.2
     size = torch.tensor([4.0, 3.2, 2.0], dtype=torch.float64)
     goal, point = corner + torch.rand(2, 3, generator=generator, dtype=torch.float64) * size
@@ -104,7 +99,9 @@ def test_geodesic_is_close_to_euclidean_in_open_space(seed):
 def test_way_approaches_the_goal_cell_by_cell():
     passable = torch.ones(40, 40, 6, dtype=torch.bool)
     passable[18:22, :30] = False
-    field = DistanceField.to(local_map(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64))
+    field = DistanceField.to(
+        surroundings_from(passable), torch.tensor([[1.0, 1.0, 0.6]], dtype=torch.float64)
+    )
     point = torch.tensor([[7.0, 1.0, 0.6]], dtype=torch.float64)
     before = float(field.way(point, 1)[0])
     for _ in range(60):
@@ -123,7 +120,7 @@ def test_way_approaches_the_goal_cell_by_cell():
 def test_geodesic_without_a_way_is_infinite():
     passable = torch.ones(20, 8, 8, dtype=torch.bool)
     passable[8:12] = False
-    here = local_map(passable)
+    here = surroundings_from(passable)
     field = DistanceField.to(here, torch.tensor([[0.5, 0.5, 0.5]], dtype=torch.float64))
     points = torch.tensor([[3.5, 0.5, 0.5], [1e9, 0.0, 0.0], [0.7, 0.5, 0.5]], dtype=torch.float64)
     metres, ahead = field.way(points, 3)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from dataclasses import replace
 
 import pytest
 import torch
@@ -33,12 +32,12 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.merging import all_origins
 from gmmtorch.mapping.learning.novelty import beam_novelty, count_explained
-from gmmtorch.occupancy.voxels.cells import Box, intersection
+from gmmtorch.occupancy.voxels.cells import intersection
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.robot_camera import DepthFrame
-from gmmtorch.team.exploration.robot.gmm_mapper import FrameRule, GmmMapper
-from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Memo
+from gmmtorch.team.exploration.mission.options import FrameRule
+from gmmtorch.team.exploration.robot.mapper import FrameUpdate, GmmMapper, Memo
 from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
@@ -440,9 +439,10 @@ def test_superseded_components_leave_the_voxels() -> None:
     speaker.receive(heard(*listener.shared.datagrams(), sender=1))
     assert speaker.shared.digest() == listener.shared.digest()
     assert_same_evidence(speaker, rebuilt(listener))
-    everywhere = Box(torch.tensor([-(10**7)] * 3), torch.tensor([10**7] * 3))
-    tiled = listener.tiles.near(everywhere, 0.2)
-    assert sum(map(len, tiled)) == len(listener.components())
+    everywhere = torch.full((3,), 1e6, dtype=torch.float64)
+    for boxes in (listener._by_rays, listener._by_explained):
+        assert sum(map(len, boxes.near(-everywhere, everywhere))) == len(listener.components())
+        assert boxes.near(everywhere, 2 * everywhere) == []
 
 
 def test_corrected_components_move_in_the_voxels() -> None:
@@ -464,15 +464,3 @@ def test_corrected_components_move_in_the_voxels() -> None:
         each.center_on(far)
     for a, b in zip(listener.local.evidence(), other.local.evidence(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-4)
-
-
-def test_the_evidence_cache_distinguishes_all_values_of_a_batch() -> None:
-    memo, one = Memo(8), first_batch()[0]
-    held = one.components()
-    moved = replace(held, means=held.means + 0.3, origins=held.origins + 0.3)
-    found = []
-    for batch in (held, moved):
-        other = mapper(codec="float", memo=memo)
-        other._enter(batch)
-        found.append(torch.stack(other.belief.grid.dense(BOX)))
-    assert not torch.equal(*found)

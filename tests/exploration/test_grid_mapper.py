@@ -13,7 +13,8 @@ from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.robot_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
+from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.sharing.broadcast import MOST_INTERVALS
@@ -76,14 +77,6 @@ def test_the_first_beam_of_a_block_decides_for_the_block(
     assert found.tolist() == novel_by_a_loop(local, seen, width, short, side)
 
 
-def test_a_frame_without_beams_has_no_novel_beams() -> None:
-    empty = beams_of_a_frame(8, 6, 0, 1.1)
-    assert len(empty.pixel) == 0
-    found = novel_beams(random_window(0), empty, 8, RULE, WITHIN)
-    assert found.shape == (0,)
-    assert found.dtype == torch.bool
-
-
 # -- memo -----------------------------------------------------------------------------------------
 
 
@@ -129,7 +122,9 @@ NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)
 def mapper(robot: int = 0, shared: bool = True, shape: tuple[int, int, int] = (40, 40, 20)) -> GridMapper:
     local = RollingWindow(0.2, shape, 4)
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
-    one = GridMapper(robot, local, belief, WIDTH, NOVELTY, Memo(64), shared, 31)
+    framework = "grid_shared" if shared else "grid_isolated"
+    team = TeamOptions(framework=framework, size=31, camera=DepthCamera(width=WIDTH), novelty=NOVELTY)
+    one = GridMapper(robot, local, belief, team, Memo(64))
     one.center_on(MIDDLE)
     return one
 

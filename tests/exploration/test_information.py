@@ -153,18 +153,6 @@ def test_csqmi_equals_enumeration_of_maps(sigma, occupancy):
     torch.testing.assert_close(got, expected.clamp_min(0), rtol=0, atol=1e-9)
 
 
-@given(beams)
-def test_fsmi_of_a_noise_free_sensor_equals_shannon_information(occupancy):
-    prior = map_probability(occupancy)
-    reading = torch.zeros(N_CELLS + 1, dtype=torch.float64).index_add_(0, FIRST, prior)
-    possible = prior > 0
-    # What a map says of the reading is certain: Σ p(m, z) log p(m, z)/(p(m) p(z)) = −Σ p(m) log p(z(m)).
-    expected = -(prior[possible] * reading[FIRST[possible]].log()).sum()
-    got = fsmi(occupancy, delta_occ=1e14, delta_emp=1e-14)
-    # Where a cell is occupied by less than 1/δ the limit is not reached.
-    torch.testing.assert_close(got, expected, rtol=0, atol=1e-10)
-
-
 @pytest.mark.parametrize(("delta_occ", "delta_emp"), [(1.5, 1 / 1.5), (20.0, 0.3)])
 @given(occupancy=beams)
 def test_fsmi_equals_the_expected_divergence_of_updated_cells(delta_occ, delta_emp, occupancy):
@@ -224,17 +212,6 @@ def test_needed_band_follows_the_depths(prior):
     assert needed_band(even, 0.05) == 1
     two = csqmi(occupancy, even, 0.05, band=2)
     torch.testing.assert_close(two, csqmi(occupancy, even, 0.05, band=39), rtol=0, atol=1e-4)
-
-
-def test_depth_kernel_equals_the_dense_kernel_within_its_band():
-    depths, lengths = uneven_depths(), torch.tensor([8, 5, 1, 0])
-    kernel = depth_kernel(depths.expand(4, 8), 0.1, 3, lengths)
-    assert kernel.shape == (3, 4, 9)
-    for row, length in enumerate(lengths.tolist()):
-        for s, i in itertools.product(range(1, 4), range(9)):
-            there = i + s < length
-            expected = math.exp(-(float(depths[i + s] - depths[i]) ** 2) / (4 * 0.01)) if there else 0.0
-            assert float(kernel[s - 1, row, i]) == pytest.approx(expected, abs=1e-12)
 
 
 SHAPE = (12, 9, 8)

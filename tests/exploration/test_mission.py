@@ -30,7 +30,7 @@ from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOp
 from gmmtorch.team.exploration.mission.results import mission_row, with_times
 from gmmtorch.team.exploration.mission.robot_view import FlyingRobotView
 from gmmtorch.team.exploration.mission.trials import assemble, make_agent, start_poses
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories
 from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.world.world import World
 from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
@@ -209,7 +209,6 @@ BAD: dict[str, dict[str, Any]] = {
     "partition": {"partitions": (Partition(0.0, 1.0, ((0, 1),)),)},
     "coordination='none'": {"coordination": "none"},
     "information='all'": {"information": "all"},
-    "window=": {"window": (40, 40, 32)},
     "codecs='jpeg'": {"codecs": ("jpeg",)},
 }
 
@@ -218,6 +217,12 @@ BAD: dict[str, dict[str, Any]] = {
 def test_bad_options_are_rejected_before_the_first_tick(world: World, message: str) -> None:
     with pytest.raises(InvalidArgumentError, match=message):
         assemble(world, replace(SMALL, **BAD[message]))
+
+
+def test_the_window_contains_what_the_camera_sees(world: World) -> None:
+    camera = DepthCamera(width=8, height=6, max_range=8.0)
+    (one,) = assemble(world, replace(SMALL, size=1, camera=camera, window=(40, 40, 32))).agents
+    assert one.options.window == (88, 88, 48)  # 2 (8 m / 0.2 m + 4), and 2 (20 + 4) of 8 m sin(FOV/2)
 
 
 def test_a_duration_within_a_frame_is_rejected_with_the_nearest_whole_ones() -> None:

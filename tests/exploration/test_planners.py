@@ -18,17 +18,14 @@ from exploration.voxel_worlds import (
     two_rooms,
 )
 
-from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.planning.collision_checking import feasible
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap, PeerTrajectories, feasible
 from gmmtorch.team.exploration.planning.journeys import Journey
 from gmmtorch.team.exploration.planning.planner_interface import Plan
-from gmmtorch.team.exploration.planning.planners import PLANNERS, find_frontiers, frontier_cells, make_planner
-from gmmtorch.team.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.planners import PLANNERS, find_frontiers, frontier_cells
 
 
 def planner_named(name: str):
-    return make_planner(name, PRIMITIVES, EVALUATOR)
+    return PLANNERS[name](PRIMITIVES, EVALUATOR)
 
 
 def same(one: Plan, other: Plan) -> bool:
@@ -166,11 +163,6 @@ def test_random_planner_persists_and_changes():
     assert explorer.flown > 15
 
 
-def test_bad_input_is_named():
-    with pytest.raises(InvalidArgumentError, match="planner='best'"):
-        make_planner("best", PRIMITIVES, EVALUATOR)
-
-
 NONE = torch.zeros(0, 3, dtype=torch.float64)
 
 
@@ -245,7 +237,7 @@ def test_known_space_has_no_frontiers():
 
 def test_frontier_planner_flies_through_the_door():
     explorer = Explorer.at(two_rooms(), (1.5, 1.5, 1.3, 0.0))
-    explore(make_planner("frontier", PRIMITIVES, EVALUATOR), explorer, 30)
+    explore(planner_named("frontier"), explorer, 30)
     beyond = ((explorer.hits + explorer.misses) > 0)[30:53, 1:-1, 1:-1].float().mean()
     assert float(beyond) > 0.6
     assert explorer.flown > 5

@@ -261,22 +261,6 @@ def has_duplicate(view: ReplayingRobotView) -> bool:
     return False
 
 
-def test_duplicate_ids_are_detected_over_udp(monkeypatch):
-    monkeypatch.setattr("gmmtorch.team.sharing.transport.security.FRESH_SECONDS", 0.1)
-    transports = [UdpTransport.unicast(5) for _ in range(2)]
-    team = [robot(5, part(k, 2, 8), transports[k], announce_every=0.05, rate=200.0) for k in range(2)]
-    views = [ReplayingRobotView(*pair) for pair in zip(team, transports, strict=True)]
-    assert not any(map(has_duplicate, views))
-    transports[0].peers, transports[1].peers = [transports[1].address], [transports[0].address]
-    until(lambda: all(map(has_duplicate, views)), *team)
-    for view, transport, other in zip(views, transports, reversed(transports), strict=True):
-        with pytest.raises(GmmTorchError, match=f"robot 5.*{other.address[1]}.*folder"):
-            view.check_id()
-        assert "another robot has id 5" in view.status()
-        assert list(view.row()["namesakes"]) == ["5"]
-        transport.close()
-
-
 class _ByPlace(Network):
     """A network that identifies robots by their place, whatever their ids."""
 

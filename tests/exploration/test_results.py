@@ -12,6 +12,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import mannwhitneyu
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
@@ -142,7 +143,7 @@ def mission(lengths: list[float], seen_by: list[int]) -> Any:
             name="w",
         ),
         options=options,
-        coordination=SimpleNamespace(name="myopic"),
+        coordination="myopic",
         score=SimpleNamespace(
             union=maps[0],
             seen_by=mask,
@@ -359,7 +360,7 @@ def test_belief_entropy_equals_the_sum_over_observable_cells(seeds: list[int], c
     assert belief.n_observed == int(((h + m) > 0).sum())
 
 
-def test_accuracy_equals_a_loop() -> None:
+def test_accuracy_equals_a_loop_and_the_rank_statistic() -> None:
     seen = observable()
     belief = BeliefMap(0.5, BOX, seen, BeliefRule())
     for seed in range(4):
@@ -368,16 +369,10 @@ def test_accuracy_equals_a_loop() -> None:
     occupied = torch.rand(len(cells), generator=torch.Generator().manual_seed(3)) < 0.3
     p = belief.probability(cells).double().tolist()
     right = [a if o else 1 - a for a, o in zip(p, occupied.tolist(), strict=True)]
-    pairs = [
-        1.0 if a > b else 0.5 if a == b else 0.0
-        for a, o in zip(p, occupied.tolist(), strict=True)
-        if o
-        for b, u in zip(p, occupied.tolist(), strict=True)
-        if not u
-    ]
+    parts = [[a for a, o in zip(p, occupied.tolist(), strict=True) if o == kind] for kind in (True, False)]
     found = accuracy(belief, cells, occupied)
     assert found["cross_entropy_bits"] == pytest.approx(-sum(map(math.log2, right)) / len(right))
-    assert found["auc"] == pytest.approx(sum(pairs) / len(pairs))
+    assert found["auc"] == pytest.approx(mannwhitneyu(*parts).statistic / len(parts[0]) / len(parts[1]))
 
 
 def test_accuracy_has_no_auc_for_cells_of_one_class() -> None:

@@ -16,15 +16,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.learning.rules import NoveltyRule
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
 from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.simulation.robot_camera import DepthFrame
+from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.mission import Mission
+from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.trials import assemble
-from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
-from gmmtorch.team.exploration.planning.journeys import Roadmap
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
 from gmmtorch.team.exploration.planning.planner_interface import (
     Plan,
     PlanningTask,
@@ -38,7 +36,6 @@ from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.view_library import ViewLibrary
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
 WINDOW = (32, 32, 16)
@@ -54,12 +51,11 @@ class Idle:
 
 def robot(start_radius: float = 0.0) -> Robot:
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
-    mapper = GridMapper(
-        0, RollingWindow(0.2, WINDOW, 4), belief, 8, NoveltyRule(resolution=0.2), Memo(8), True, 3
-    )
+    team = TeamOptions(framework="grid_shared", camera=DepthCamera(width=8, height=6))
+    mapper = GridMapper(0, RollingWindow(0.2, WINDOW, 4), belief, team, Memo(8))
     mapper.center_on(START[:3])
     launch = InitialFreeSpace(cells_in_sphere(START[:3], start_radius, 0.2), START[None, :3])
-    return Robot(0, START, mapper, Idle(), ViewLibrary(0), Roadmap(), launch, StoppingRule())
+    return Robot(0, START, mapper, Idle(), launch, StoppingRule())
 
 
 def plan(path: Tensor) -> Plan:
@@ -77,30 +73,20 @@ def zigzag(n: int = 10) -> Tensor:
     return path
 
 
-def test_path_length_is_the_sum_of_the_steps() -> None:
+def test_path_length_is_the_sum_of_the_steps_and_a_robot_stays_at_the_end() -> None:
     one, path = robot(), zigzag()
     one.follow(plan(path))
     assert torch.equal(one.advance(0, 3), path[:3, :3])
     assert one.path_length == pytest.approx(0.3 + 0.4 + 0.3)
     assert torch.equal(one.state, path[2])
-    assert torch.equal(one.advance(3, 6), path[3:6, :3])
-    assert one.path_length == pytest.approx(3 * 0.3 + 3 * 0.4)
-    assert torch.equal(one.state, path[5])
-
-
-def test_a_robot_stays_at_the_end_of_its_path() -> None:
-    one, path = robot(), zigzag()
-    one.follow(plan(path))
-    one.advance(0, 8)
-    assert one.advance(8, 13).shape == (2, 3)
+    assert one.advance(3, 13).shape == (7, 3)
     flown = one.path_length
     assert flown == pytest.approx(5 * 0.3 + 5 * 0.4)
     for _ in range(3):
         assert one.advance(13, 18).shape == (0, 3)
         assert one.path_length == flown
         assert torch.equal(one.state, path[-1])
-    # The next plan starts there.
-    back = path.flip(0)[1:]
+    back = path.flip(0)[1:]  # the next plan starts there
     one.follow(plan(back))
     one.advance(0, 9)
     assert one.path_length == pytest.approx(2 * flown - 0.3)
@@ -260,13 +246,6 @@ def test_news_wake_a_resting_robot_for_at_least_a_window():
         assert not returns.rests
     returns.note(46, 110, 175.0)
     assert returns.rests
-
-
-def test_a_zero_share_never_rests():
-    returns = StoppingCriterion(StoppingRule(0.0, window=4.0))
-    for now in range(50):
-        returns.note(now, 0.0, 0.0)
-    assert not returns.rests
 
 
 @pytest.mark.parametrize(

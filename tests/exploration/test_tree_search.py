@@ -10,8 +10,7 @@ import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, Explorer, surroundings_from, task_of
 
 from gmmtorch.kernels import kernels
-from gmmtorch.team.exploration.planning.collision_checking import feasible
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, feasible
 from gmmtorch.team.exploration.planning.journeys import DistanceField, Goal
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
 from gmmtorch.team.exploration.planning.tree_search import SearchRule, search_tree

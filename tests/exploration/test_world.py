@@ -16,15 +16,16 @@ from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
 from gmmtorch.simulation.furniture import box
 from gmmtorch.simulation.mesh_world import MeshWorld
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
-from gmmtorch.team.exploration.world.navigable import (
+from gmmtorch.team.exploration.world.starts import check_start, start_poses
+from gmmtorch.team.exploration.world.world import (
+    World,
     collides,
     meets_others,
     observable_cells,
+    open_world,
     view_directions,
     viewpoints,
 )
-from gmmtorch.team.exploration.world.starts import check_start, start_poses
-from gmmtorch.team.exploration.world.world import World, open_world
 
 
 @pytest.fixture(autouse=True)
@@ -289,31 +290,6 @@ def test_observable_cells_of_a_smaller_box_are_a_crop():
     part = seen_from(cells - window.low, directions, 4.0, window)
     # A ray that leaves a convex window does not come back.
     assert torch.equal(part, whole[1:9, 2:14, 3:9])
-
-
-def test_observable_cells_have_a_line_of_sight():
-    start = viewpoints(~_solid(), 3)
-    found = seen_from(start, view_directions(1.2, 0.06), 6.0)
-    inside = torch.zeros(LATTICE.shape, dtype=torch.bool)
-    inside[11:13, 5:10, 1:6] = True  # the block, without the cells that its faces meet
-    assert not bool((found & inside).any())
-    occupied = occupied_cells(ROOM, RESOLUTION, LATTICE)
-    free = ~occupied & ~inside
-    assert float(found[free].double().mean()) > 0.98
-    mesh = MeshWorld(ROOM)
-    eyes = (start + 0.5).double() * RESOLUTION
-    for cell in (found & free).nonzero()[::149]:
-        corners = (cell + torch.rand(60, 3, generator=torch.Generator().manual_seed(1))).double() * RESOLUTION
-        way = corners[:, None] - eyes
-        length = way.norm(dim=2)
-        sight = mesh.distances(eyes.repeat(60, 1), (way / length[..., None]).flatten(0, 1)).view(60, -1)
-        assert bool((sight > length).any())
-
-
-def _solid() -> Tensor:
-    solid = occupied_cells(ROOM, RESOLUTION, LATTICE)
-    solid[10:14, 4:11, :7] = True
-    return solid
 
 
 def test_view_directions_cover_the_view_evenly(generator):

@@ -11,13 +11,16 @@ from torch import Tensor
 
 from gmmtorch.occupancy.voxels.cells import Box
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere, local_map_of
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import (
+    LocalMap,
+    PeerTrajectories,
+    cells_in_sphere,
+    local_map_of,
+)
 from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import Plan, Planner, PlanningTask
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.sharing.view_library import ViewLibrary
 
 RESOLUTION = 0.2

@@ -104,7 +104,7 @@ def warn_of_robots_at_their_start(mission: Mission) -> None:
     if stayed and mission.elapsed >= _TIME_TO_LEAVE:
         logger.warning(
             "Robots that never left their start: %s. No path away from there is safe. Move them by "
-            "team.start, or use smaller cells (world.resolution) or a smaller robot.radius.",
+            "team.start, or use smaller cells (world.resolution).",
             ", ".join(stayed),
         )
 

@@ -158,9 +158,10 @@ _OF_VARIANTS = {
     "planner": "planner.name",
     "information": "information",
     "coordination": "coordination",
-    "codec": "codec",
 }
 """The options that a variant of a study may set, beside those of `network.*`, by its names for them."""
+_OF_PYTHON = {"planning_prior", "codec"}
+"""Fields of `TeamOptions` that a variant may set, and that are no options."""
 
 
 def variants_of(config: DictConfig) -> list[dict[str, Any]]:
@@ -214,8 +215,7 @@ def world_options(config: DictConfig) -> WorldOptions:
 
 def open_world(world: WorldOptions, team: TeamOptions, on_event: Event = ignore) -> World:
     """The world for this team; errors name options."""
-    of_team = {"robot_radius": "robot.radius", "max_range": "sensor.max_range"}
-    with naming({**argument_names(WorldOptions), **of_team}):
+    with naming(argument_names(WorldOptions)):
         return world.open(team, on_event)
 
 
@@ -225,9 +225,9 @@ def team_options(config: DictConfig, seed: int, variant: dict[str, Any]) -> Team
     options = {key: value for key, value in variant.items() if key in {*_OF_VARIANTS, *config.network}}
     names = {_name(key): f"study.variants: {key}" for key in options}
     rules: dict[str, dict[str, Any]] = {"novelty": {"resolution": config.world.resolution}, "frame": {}}
-    for key in variant.keys() - options.keys() - {"planning_prior"}:
+    for key in variant.keys() - options.keys() - _OF_PYTHON:
         rules["frame" if hasattr(FrameRule, key) else "novelty"][key] = variant[key]
-    others = {"planning_prior": variant["planning_prior"]} if "planning_prior" in variant else {}
+    others = {key: variant[key] for key in _OF_PYTHON if key in variant}
     with naming(names):
         device = config.runtime.device
         made = build(TeamOptions, _changed(config, options), seed=seed, device=device, **others)
@@ -257,9 +257,8 @@ def _changed(config: DictConfig, options: dict[str, Any]) -> DictConfig:
 
 _PART = "consecutive"  # each robot's part of the log: a stretch that it could have driven
 _NO_RESTART = (
-    "A robot with team=%s codec=%s cannot be restarted while its team runs: it would number its messages "
-    "from 0 again, and its teammates would ignore them as repetitions. Use team=gmm_shared codec=quantized "
-    "if it may be restarted."
+    "A robot with team=%s cannot be restarted while its team runs: it would number its messages from 0 "
+    "again, and its teammates would ignore them as repetitions. Use team=gmm_shared if it may be restarted."
 )
 
 
@@ -278,7 +277,7 @@ def flying(config: DictConfig, transport: FramedTransport, stack: ExitStack) -> 
         store.restore(shared)
         agent.keep_in(store)
     elif options.shares:
-        logger.warning(_NO_RESTART, config.team.name, config.codec)
+        logger.warning(_NO_RESTART, config.team.name)
     mission = Mission(world, [agent], options, watch)
     return mission, FlyingRobotView(mission, transport)
 

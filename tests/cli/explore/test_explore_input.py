@@ -33,7 +33,7 @@ from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start
         ("world.bounds=[0,0,0,3]", "world.bounds= six"),
         ("world.resolution=0", "world.resolution=0.0"),
         ("sensor.width=0", "sensor.width=0"),
-        ("sensor.max_range=0.05", "sensor.max_range=0.05 robot.radius world.resolution"),
+        ("sensor.max_range=0.05", "sensor.max_range no longer DepthCamera"),
         ("duration=2.5", "duration=2.5 sensor.rate"),
         ("sensor.rate=0.7", "sensor.rate=0.7 dynamics.duration"),
         ("duration=-1", "duration=-1.0"),
@@ -43,25 +43,24 @@ from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start
         ("network.partitions=[cut]", "network.partitions[0]='cut'"),
         ("network.announce=0", "network.announce=0.0 seconds"),
         ("network.budget=0", "network.budget=0.0 bytes"),
-        ("map.window=[8,8]", "map.window=[8, three"),
-        ("map.window=[8,8,8]", "map.window=[8, sensor.max_range"),
         ("map.side=0", "map.side=0.0"),
         ("map.noise=0.05", "map.noise map.side"),
         ("information=x", "information='x' csqmi fsmi"),
         ("coordination=x", "coordination='x' myopic greedy"),
-        ("rounds=0", "rounds=0"),
-        ("codec=zip", "codec='zip' quantized thesis"),
+        ("rounds=2", "rounds no longer three"),
+        ("codec=thesis", "codec no longer team=gmm_thesis"),
+        ("experiment=fig4_4_entropy study.variants=[{codec:zip}]", "codec='zip' quantized thesis"),
         ("transport=zenoh", "transport='zenoh' in_process"),
         ("evaluation.codecs=[jpeg]", "evaluation.codecs 'jpeg' octree draco"),
         ("evaluation.every=0", "evaluation.every=0.0"),
-        ("robot.radius=5", "robot.radius=5.0 room"),
+        ("robot.radius=5", "robot.radius no longer Dynamics"),
         ("runtime.threads=0", "runtime.threads=0"),
         ("runtime.device=meta", "runtime.device=meta"),
         ("seed=-1", "seed=-1"),
         ("experiment=fig4_4_entropy runtime.workers=0", "runtime.workers=0"),
         ("experiment=fig4_4_entropy study.name=other", "study.name='other' trials"),
         ("experiment=fig4_4_entropy study.variants=[]", "study.variants study.seeds"),
-        ("planner.rest=1.5", "planner.rest=1.5"),
+        ("planner.rest=0", "planner.rest no longer TeamOptions.rest"),
         ("experiment=fig4_4_entropy study.variants=[{colour:1}]", "study.variants colour team planner"),
         ("experiment=fig4_4_entropy study.variants=[{team:x}]", "team='x' gmm_shared"),
         ("experiment=fig4_4_entropy study.variants=[{announce:0}]", "study.variants: announce=0"),
@@ -110,7 +109,7 @@ def test_a_file_that_is_not_a_mesh_is_named(kind, run, tmp_path):
 def test_half_a_mesh_is_rejected(run, tmp_path, room):
     path = tmp_path / "half.obj"
     path.write_text(room.read_text()[:-60])
-    line = refused(run(f"world.path={path}", "robot.radius=3"))
+    line = refused(run(f"world.path={path}"))
     assert "half" in line
 
 

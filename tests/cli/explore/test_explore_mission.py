@@ -159,7 +159,7 @@ def test_teams_of_grids_leave_no_mixture(run):
 def test_options_reach_the_mission(run):
     options = ["information=fsmi", "coordination=myopic", "network.loss=0.5", "world.resolution=0.25"]
     cut = {"begin": 1.0, "end": 9.0, "groups": [[0], [1]]}  # until after the mission
-    options += ["network.reach=15"]
+    options += ["network.jitter=0.02", "network.duplication=0.5", "network.reach=15", "network.delay=0.1"]
     options += ["network.partitions=[{begin: 1, end: 9, groups: [[0], [1]]}]", "duration=4"]
     options += ["network.announce=1.5", "network.budget=2000"]
     options += ["evaluation.codecs=[octree]", "team.start=[[2,3,1.5,0],[5,3,1.5,3]]"]
@@ -167,8 +167,8 @@ def test_options_reach_the_mission(run):
     (row,) = done.results()["rows"]
     names = ["information", "coordination", "loss", "resolution"]
     assert [row[name] for name in names] == ["fsmi", "myopic", 0.5, 0.25]
-    names = ["reach", "partitions", "announce", "budget"]
-    assert [row[name] for name in names] == [15.0, [cut], 1.5, 2000.0]
+    names = ["delay", "jitter", "duplication", "reach", "partitions", "announce", "budget"]
+    assert [row[name] for name in names] == [0.1, 0.02, 0.5, 15.0, [cut], 1.5, 2000.0]
     assert row["bytes_by_kind"]["announcements"] > 0
     assert row["reception"]["cut_off"] > 0
     assert 0 < row["bytes_octree"] < row["bytes_raw_points"]

@@ -101,7 +101,7 @@ def test_a_single_robot_flies_and_reports(run, tmp_path):
     assert "cannot be restarted" not in done.stdout
 
 
-@pytest.mark.parametrize("options", ["team=grid_shared", "codec=thesis"])
+@pytest.mark.parametrize("options", ["team=grid_shared", "team=gmm_thesis"])
 def test_a_robot_that_cannot_be_restarted_is_warned_of(run, tmp_path, options):
     world = ["world=mesh", f"world.path={room_mesh(tmp_path / 'room.obj')}", *SMALL]
     done = succeeded(run(*world, options, "duration=1", "settle=0"))

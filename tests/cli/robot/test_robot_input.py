@@ -126,7 +126,7 @@ def test_facts_that_identify_a_world(tmp_path):
         warehouse = facts()
         for other in ("world=tunnels", "world.seed=1", "world.size=[20,20,8]"):
             assert facts(other) != warehouse, other
-        for same in ("seed=3", "world.resolution=0.4", "team.size=2", "sensor.max_range=4", "planner=random"):
+        for same in ("seed=3", "world.resolution=0.4", "team.size=2", "planner=random"):
             assert facts(same) == warehouse, same
         one, moved = room_mesh(tmp_path / "one.obj"), room_mesh(tmp_path / "moved.obj")
         meshes = [facts("world=mesh", f"world.path={path}") for path in (one, moved)]

@@ -7,8 +7,8 @@ import torch
 from kernels.twins import by_both
 
 from gmmtorch.kernels import kernels
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 FOV = (1.5184, 1.0123)
 

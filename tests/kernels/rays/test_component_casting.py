@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from exploration.ray_cases import evidence_of
 from kernels.twins import by_both
 from mapping.random_components import random_components
 
@@ -13,7 +14,6 @@ from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.team.exploration.robot.component_rays import component_evidence
 
 OPTIONS = {
     "plain": {},
@@ -50,7 +50,7 @@ def cases() -> dict[str, Components]:
 
 
 def both(components: Components, box: Box, **options) -> tuple[CellEvidence, CellEvidence]:
-    return by_both(lambda: in_order(component_evidence(components, 0.2, box, **options)))
+    return by_both(lambda: in_order(evidence_of(components, 0.2, box, **options)))
 
 
 def in_order(evidence: CellEvidence) -> CellEvidence:
@@ -71,9 +71,9 @@ def test_fused_casting_equals_the_twin_up_to_rounding(case, box, kind):
 def test_evidence_of_a_part_of_the_world_is_that_part_of_all_evidence():
     with kernels("fused"):
         components, options = cases()["random"], OPTIONS["thinned"]
-        whole = component_evidence(components, 0.2, box_of("everything"), **options)
+        whole = evidence_of(components, 0.2, box_of("everything"), **options)
         slab = box_of("slab")
-        part = component_evidence(components, 0.2, slab, **options)
+        part = evidence_of(components, 0.2, slab, **options)
     inside = ((whole.cells >= slab.low) & (whole.cells < slab.high)).all(1)
     assert torch.equal(whole.cells[inside], part.cells)
     # Viewpoints whose points cannot be in the slab draw fewer of them, which changes the sums' rounding.
@@ -88,4 +88,4 @@ def test_covariances_without_a_factor_are_repaired_as_by_the_twin():
     assert torch.equal(one.misses, other.misses)
     flat[1, 0, 0] = torch.nan
     with kernels("fused"), pytest.raises(NumericalError, match=r"covariances\["):
-        component_evidence(replace(some, covariances=flat), 0.2, box_of("everything"))
+        evidence_of(replace(some, covariances=flat), 0.2, box_of("everything"))

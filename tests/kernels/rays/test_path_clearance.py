@@ -8,8 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.kernels.compiler import compiler_failure
-from gmmtorch.team.exploration.planning.collision_checking import feasible, feasible_motions, local_map_of
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import (
+    PeerTrajectories,
+    feasible,
+    feasible_motions,
+    local_map_of,
+)
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 
 pytestmark = [

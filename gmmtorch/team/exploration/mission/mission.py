@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,12 @@ from gmmtorch.occupancy import Box, to_lattice
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.planning.coordination import Coordination, PeerTrajectories, predicted_path
+from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, predicted_path
 from gmmtorch.team.exploration.planning.planner_interface import Plan
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate
-from gmmtorch.team.exploration.world.navigable import collides, finely, meets_others
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.exploration.world.world import World, collides, finely, meets_others
 from gmmtorch.team.sharing import Network, bytes_of_points
 
 _SEEN_STRIDE = 4  # pixels between the beams, along rows and columns, that mark cells as seen
@@ -108,6 +107,49 @@ class MissionScore:
         return lacking / everything.size if everything else 0.0
 
 
+COORDINATIONS = ("myopic", "greedy", "distributed_greedy", "random_partition")
+_ROUNDS = 3  # of the last two
+
+
+def coordinate(
+    name: str,
+    n_robots: int,
+    plan: Callable[[int, dict[int, Plan]], Plan],
+    generator: torch.Generator,
+    n_rounds: int = _ROUNDS,
+) -> dict[int, Plan]:
+    """The plans of robots 0 … n_robots − 1 by one of `COORDINATIONS`, in the order in which they were fixed.
+
+    "myopic": each robot plans as if it were alone. "greedy": robots plan one after the other, and each
+    considers all earlier plans; if the joint value is monotone and submodular, the result is at least half
+    of the optimum. The other rules take `n_rounds` rounds. In a round robots plan at the same time and
+    consider the plans of the rounds before. "random_partition": each robot plans in one random round.
+    "distributed_greedy": all remaining robots plan in every round, and an equal share of them, those with
+    the best plans, keep their plans.
+
+    plan: called with a robot and the plans of other robots that it must consider; returns its plan.
+    """
+    everyone, settled = list(range(n_robots)), dict[int, Plan]()
+    if name == "distributed_greedy":
+        left = everyone
+        for k in range(n_rounds):
+            found = {robot: plan(robot, dict(settled)) for robot in left}
+            best = sorted(left, key=lambda robot: -found[robot].value)  # the first of equals comes first
+            best = best[: -(-len(left) // (n_rounds - k))]
+            settled.update((robot, found[robot]) for robot in best)
+            left = [robot for robot in left if robot not in best]
+        return settled
+    rounds = [everyone]
+    if name == "greedy":
+        rounds = [[robot] for robot in everyone]
+    elif name == "random_partition":
+        drawn = torch.randint(n_rounds, (n_robots,), generator=generator).tolist()
+        rounds = [[robot for robot in everyone if drawn[robot] == k] for k in range(n_rounds)]
+    for robots in rounds:
+        settled.update({robot: plan(robot, dict(settled)) for robot in robots})
+    return settled
+
+
 class Mission:
     """Robots that sense in every tick, and plan every few ticks. A tick lasts one frame of the camera.
 
@@ -136,9 +178,7 @@ class Mission:
         self.trajectories: list[list[Tensor]] = [[robot.state[:4].clone()] for robot in self.robots]
         """Poses (4,) x, y, z, yaw of each robot: at the start, and after each tick."""
         # Robots that share nothing plan independently.
-        self.coordination = Coordination(
-            options.coordination if options.shares else "myopic", options.n_rounds
-        )
+        self.coordination = options.coordination if options.shares else "myopic"
         self._network, self._score = network, score
         self._mesh = world.mesh.to(options.device)  # where cameras see it
         self._generator = torch.Generator().manual_seed(options.seed)
@@ -279,7 +319,7 @@ class Mission:
 
 def plan_together(
     agents: Sequence[Agent],
-    coordination: Coordination,
+    coordination: str,
     options: TeamOptions,
     now: float,
     number: int,
@@ -313,7 +353,7 @@ def plan_together(
         proposed[robot] = agent.propose(now, final, peers)
         return proposed[robot]
 
-    plans = coordination.coordinate(range(len(agents)), plan_of, generator)
+    plans = coordinate(coordination, len(agents), plan_of, generator)
     for robot in plans:
         agents[robot].follow()
     send(plans)
@@ -350,11 +390,11 @@ def _peer_trajectories(
     robot: int,
     final: Mapping[int, Plan],
     proposed: Mapping[int, Plan],
-    coordination: Coordination,
+    coordination: str,
     options: TeamOptions,
 ) -> PeerTrajectories:
     """Where the other robots may be: on their final or proposed plan, and braking if that may change."""
-    stays_final = coordination.name != "distributed_greedy"
+    stays_final = coordination != "distributed_greedy"
     paths = []
     for other in agents:
         if other.number == robot:

@@ -17,8 +17,6 @@ from gmmtorch.simulation import CameraOptions
 from gmmtorch.team.sharing import LinkConditions
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from gmmtorch.mapping import SurfaceFit
     from gmmtorch.simulation import DepthCamera
     from gmmtorch.team.exploration.world.scoring import BeliefRule
@@ -32,7 +30,6 @@ _EMPTY_LENGTH = 2 / 3
 """Length of components of free space, as a share of that of surfaces."""
 _FLAT = 0.5
 """Thickness of a flat piece, as a share of `FrameRule.side`."""
-_ROUNDING = 1e-9
 
 FRAMEWORKS = ("gmm_shared", "grid_shared", "grid_isolated", "gmm_thesis")
 """E0, E1 and E2 of the thesis; and `gmm_shared` with the options of `THESIS`."""
@@ -61,7 +58,8 @@ class Dynamics:
         speed, climb, yaw_rate: largest velocities along the heading, up or down, and of the yaw.
         acceleration: largest acceleration along the heading and vertically, m/s².
         yaw_acceleration: largest yaw acceleration, rad/s².
-        duration: of a primitive. step: time between two states of a path; it divides the duration.
+        radius: of a sphere around the body. duration: of a primitive.
+        step: time between two states of a path; it divides the duration.
 
     Raises `InvalidArgumentError` unless all are above zero and the step divides the duration.
     """
@@ -73,7 +71,7 @@ class Dynamics:
     yaw_acceleration: float = 3.0
     duration: float = 2.0
     step: float = 0.2
-    radius: float = option(0.3, "radius (m) of a sphere around the body")
+    radius: float = 0.3
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -87,47 +85,6 @@ class Dynamics:
     def n_steps(self) -> int:
         """Number of states on the path of a primitive."""
         return round(self.duration / self.step)
-
-    @property
-    def n_braking_steps(self) -> int:
-        """Number of states until rest from the largest velocities."""
-        return int(self._n_ramp_steps(self._limits).max())
-
-    @property
-    def _limits(self) -> Tensor:
-        import torch
-
-        return torch.tensor([self.speed, self.climb, self.yaw_rate], dtype=torch.float64)
-
-    def _n_ramp_steps(self, change: Tensor) -> Tensor:
-        """Number of whole steps that changes (..., 3) of the velocities take."""
-        import torch
-
-        rates = [self.acceleration, self.acceleration, self.yaw_acceleration]
-        per_step = torch.tensor(rates, dtype=torch.float64) * self.step
-        return (change.abs() / per_step - _ROUNDING).ceil()
-
-    def velocities(self, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
-        """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
-
-        Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
-        constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
-        beyond the limits.
-        """
-        import torch
-
-        now = states[..., 4:]
-        if not bool((now.abs() <= self._limits * (1 + _ROUNDING)).all()):  # also catches NaN
-            worst = now.reshape(-1, 3).abs().amax(0).tolist()
-            raise InvalidArgumentError(
-                f"states have velocities up to {worst}; speed, climb and yaw_rate allow "
-                f"{self._limits.tolist()}."
-            )
-        change = commands - now
-        n_ramp = self._n_ramp_steps(change).clamp_min(1)[..., None, :]
-        time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
-        ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
-        return torch.where(time < n_ramp, ramp, commands[..., None, :])
 
 
 @dataclass(frozen=True)
@@ -197,11 +154,7 @@ class StoppingRule:
     """When a robot rests: once it has learned less in the last `window` seconds than `share` of the most that
     it ever learned in one window. The window should be longer than a flight across the map."""
 
-    share: float = option(
-        0.01,
-        "a robot stops if two minutes give less than this share of its best two minutes; 0: never",
-        "rest",
-    )
+    share: float = 0.01
     window: float = 120.0
 
     def __post_init__(self) -> None:
@@ -216,10 +169,6 @@ def _camera() -> DepthCamera:
     return DepthCamera()
 
 
-def _novelty() -> NoveltyRule:
-    return NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
-
-
 def _belief() -> BeliefRule:
     from gmmtorch.team.exploration.world.scoring import BeliefRule
 
@@ -232,6 +181,9 @@ class TeamOptions(LinkConditions):
 
     belief: from evidence to occupancy, for every team and for the evaluation. n_beams: of a view.
     planning_prior: occupancy of unobserved cells in the information of a view.
+    window: cells along x, y and z of the local map around a robot, for planning, at least: it contains what
+    the camera sees.
+    codec: of components: quantized (about 6 bytes each), float, or thesis (57 bytes), see `CODECS`.
     margin: metres between robots. device: of the maps, of learning, and of the information of views; sensing,
     planning and messages are on the CPU. A robot plans once every `dynamics.duration`.
     """
@@ -242,23 +194,20 @@ class TeamOptions(LinkConditions):
     seed: int = option(0, "seed of sensor noise, network and planners")
     rate: float = option(1.0, "frames per second", "sensor.rate")
     camera: DepthCamera = group(CameraOptions, "sensor", make=_camera)
-    dynamics: Dynamics = group(Dynamics, "robot")
+    dynamics: Dynamics = field(default_factory=Dynamics)
     belief: BeliefRule = field(default_factory=_belief)
-    novelty: NoveltyRule = field(default_factory=_novelty)
-    frame: FrameRule = group(FrameRule, "map")
-    window: tuple[int, int, int] = option(
-        (80, 80, 40), "cells along x, y and z of the local map around a robot, for planning", "map.window"
+    novelty: NoveltyRule = field(
+        default_factory=lambda: NoveltyRule(resolution=0.2, observed=0.5, distance=2.0)
     )
+    frame: FrameRule = group(FrameRule, "map")
+    window: tuple[int, int, int] = (80, 80, 40)
     planner: str = option("mcts", "mcts, frontier or random", "planner.name")
     information: str = option("csqmi", "measure of the information of a view: csqmi or fsmi")
     n_beams: int = 160
     coordination: str = option("greedy", "myopic, greedy, distributed_greedy or random_partition")
-    n_rounds: int = option(3, "rounds of distributed_greedy and random_partition", "rounds")
     planning_prior: float = 0.125
-    rest: StoppingRule = group(StoppingRule, "planner")
-    codec: str = option(
-        _CODEC, "code of components: quantized (about 6 bytes each), float, or thesis (57 bytes)"
-    )
+    rest: StoppingRule = field(default_factory=StoppingRule)
+    codec: str = _CODEC
     announce_every: float = option(
         10.0, "seconds between announcements of a robot's records, while these change", "network.announce"
     )
@@ -278,7 +227,7 @@ class TeamOptions(LinkConditions):
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        from gmmtorch.team.exploration.planning.coordination import Coordination
+        from gmmtorch.team.exploration.mission.mission import COORDINATIONS
         from gmmtorch.team.exploration.planning.planners import PLANNERS
         from gmmtorch.team.exploration.planning.view_evaluator import INFORMATION
         from gmmtorch.team.sharing import POINT_CODECS, Radio, check_codec
@@ -286,6 +235,7 @@ class TeamOptions(LinkConditions):
         super().__post_init__()
         check_choice("team", self.framework, FRAMEWORKS)
         check_choice("planner", self.planner, PLANNERS)
+        check_choice("coordination", self.coordination, COORDINATIONS)
         check_choice("information", self.information, INFORMATION)
         for name in self.codecs:
             check_choice("codecs", name, tuple(POINT_CODECS))
@@ -301,7 +251,6 @@ class TeamOptions(LinkConditions):
         if self.start is not None:
             object.__setattr__(self, "start", _checked_poses(self.start))
         # These check their own arguments.
-        Coordination(self.coordination, self.n_rounds)
         Radio.check(self.announce_every, self.budget)
         self.check_team(self.size)
         if not 0 < self.planning_prior < 1:
@@ -421,16 +370,10 @@ class WorldOptions:
         """The world for robots with this camera and this body."""
         from gmmtorch.team.exploration.world.world import open_world
 
-        return open_world(
-            self.name,
-            path=self.path,
-            bounds=self.bounds,
-            seed=self.seed,
-            size=self.size,
-            resolution=self.resolution,
-            vertical_fov=team.camera.vertical_fov,
-            max_range=team.camera.max_range,
-            robot_radius=team.dynamics.radius,
-            cache=self.cache,
-            on_event=on_event,
-        )
+        camera, radius = team.camera, team.dynamics.radius
+        of_team: dict[str, Any] = {
+            "vertical_fov": camera.vertical_fov,
+            "max_range": camera.max_range,
+            "robot_radius": radius,
+        }
+        return open_world(**vars(self), **of_team, on_event=on_event)

@@ -156,7 +156,7 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "duration": options.duration,
         "planner": options.planner,
         "information": options.information,
-        "coordination": mission.coordination.name,
+        "coordination": mission.coordination,
         **options.learning,
         "planning_prior": options.planning_prior,
         "delay": options.latency,

@@ -19,8 +19,7 @@ from gmmtorch.simulation import DepthCamera
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.replay import ReplayMission
 from gmmtorch.team.exploration.robot.agent import Agent
-from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.team.exploration.robot.mapper import Mapper
+from gmmtorch.team.exploration.robot.mapper import GmmMapper, Mapper
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import (
     FramedTransport,

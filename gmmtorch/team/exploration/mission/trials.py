@@ -28,17 +28,15 @@ from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, 
 from gmmtorch.team.exploration.mission.mission import Mission, MissionScore
 from gmmtorch.team.exploration.mission.options import TeamOptions, WorldOptions
 from gmmtorch.team.exploration.mission.results import mission_row
-from gmmtorch.team.exploration.planning.journeys import Roadmap
-from gmmtorch.team.exploration.planning.planners import make_planner
+from gmmtorch.team.exploration.planning.planners import PLANNERS
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
 from gmmtorch.team.exploration.robot.agent import Agent, Robot
-from gmmtorch.team.exploration.robot.gmm_mapper import GmmMapper
-from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
+from gmmtorch.team.exploration.robot.mapper import GmmMapper, GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport, ViewLibrary
+from gmmtorch.team.sharing import Broadcast, Network, Replica, Transport
 
 _SLACK = 24
 """Cells by which the sliding map moves, once the robot is so far from its centre. Rays are long: a map that
@@ -103,7 +101,7 @@ def make_agent(
 
     Raises `InvalidArgumentError` for options that contradict each other or the world.
     """
-    _check_window(options, world.resolution)
+    options = _with_window(options, world.resolution)
     memo = Memo(_CACHED_MESSAGES_ALONE) if memo is None else memo
     evidence = Memo(_CACHED_EVIDENCE) if evidence is None else evidence
     camera = options.camera
@@ -126,28 +124,24 @@ def make_agent(
         number,
         pose,
         _mapper(number, world, options, memo, evidence, incarnation),
-        make_planner(options.planner, primitives, evaluator),
-        ViewLibrary(number, incarnation=incarnation),
-        Roadmap(),
+        PLANNERS[options.planner](primitives, evaluator),
         start,
         options.rest,
+        incarnation,
     )
     watch = Stopwatch() if watch is None else watch
     return Agent(robot, transport, evaluator, primitives, options, memo, watch)
 
 
-def _check_window(options: TeamOptions, resolution: float) -> None:
-    """Raises `InvalidArgumentError` unless the window contains the camera's whole field of view."""
+def _with_window(options: TeamOptions, resolution: float) -> TeamOptions:
+    """The options with a window that contains the camera's whole field of view."""
     camera = options.camera
     far = (camera.max_range, camera.max_range, camera.max_range * math.sin(camera.vertical_fov / 2))
-    for axis, n, needed in zip("xyz", options.window, far, strict=True):
-        sight = (n / 2 - _ROUNDING) * resolution
-        if sight < needed:
-            raise InvalidArgumentError(
-                f"‹window›={list(options.window)} cells of {resolution} m reaches {max(sight, 0):.3g} m "
-                f"around the robot along {axis}, less than the {needed:.3g} m that a camera of "
-                f"‹max_range›={camera.max_range} m sees; take a larger window."
-            )
+    x, y, z = (
+        max(n, 2 * (math.ceil(sight / resolution) + _ROUNDING))
+        for n, sight in zip(options.window, far, strict=True)
+    )
+    return replace(options, window=(x, y, z))
 
 
 def _mapper(
@@ -156,16 +150,12 @@ def _mapper(
     x, y, z = (n + 2 * (_SLACK + _ROUNDING) for n in options.window)
     local = RollingWindow(world.resolution, (x, y, z), _SLACK, options.device)
     belief = BeliefMap(world.resolution, world.box, world.observable, options.belief, options.device)
-    width = options.camera.width
     if not options.has_mixtures:
-        team = options.shares, options.size
-        return GridMapper(number, local, belief, width, options.novelty, evidence, *team, memo.decoded)
-    shared: Replica | Broadcast
+        return GridMapper(number, local, belief, options, evidence, memo.decoded)
     if options.codec == "quantized":
-        shared = Replica(number, dim=3, incarnation=incarnation)
-    else:
-        shared = Broadcast(number, options.codec)
-    return GmmMapper(local, belief, width, options.novelty, options.frame, evidence, shared)
+        replica = Replica(number, dim=3, incarnation=incarnation)
+        return GmmMapper(local, belief, options, evidence, replica)
+    return GmmMapper(local, belief, options, evidence, Broadcast(number, options.codec))
 
 
 ROW = "row.json"

@@ -1,4 +1,5 @@
-"""Collision checking: where a robot's body fits in the known free space, and which paths are safe.
+"""Collision checking: where a robot's body fits in the known free space, which paths are safe there, and
+clear of other robots.
 
 The robot is a sphere. A cell is passable if a robot with its centre anywhere in the cell touches only
 cells that are known to be free, with a margin of half a cell. A path is therefore safe between checked
@@ -9,25 +10,92 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import InvalidArgumentError, check_number
 from gmmtorch.kernels import FreeSpace, motions_are_clear
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
+from gmmtorch.occupancy import Box
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.exploration.world.navigable import widened
+from gmmtorch.team.sharing import PlanMessage
 
-_SPACING, _FINE_SPACING = 1.0, 0.25
-"""Cells between the checked points of a path, half of which is the margin around the body; and the same for a
-robot that leaves a place where it does not fit."""
+_FINE_SPACING = 0.25
+"""Cells between the checked points of a path on which a robot leaves a place where it does not fit; half of
+this is the margin around the body. On other paths it is one cell."""
 _STRUCK_RAYS, _STRUCK_SHARE = 1.0, 0.05
 """A cell with at least this many hits and this share of hits among its rays is an obstacle. A rail of a
 twentieth of a cell's width is hit by no larger share."""
 _ROUNDING = 1e-9
 _CHUNK_PAIRS = 1 << 22
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMap:
+    """A dense snapshot (nx, ny, nz) of the cells of the sliding map.
+
+    low: (3,) int64, index of the lowest cell; cell c is [c, c + 1) · resolution, world frame.
+    resolution: side (m) of the cells.
+    occupancy: (nx, ny, nz) float32, with the planner's prior where nothing was observed.
+    observed: bool, cells with any evidence.
+    free: bool, known to be free.
+    passable: bool, where the centre of the robot may be: all cells that its body touches are free.
+    """
+
+    low: Tensor
+    resolution: float
+    occupancy: Tensor
+    observed: Tensor
+    free: Tensor
+    passable: Tensor
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.free.shape)
+
+    @property
+    def box(self) -> Box:
+        return Box(self.low, self.low + torch.tensor(self.shape))
+
+    @cached_property
+    def _size(self) -> Tensor:
+        return torch.tensor(self.shape)
+
+    def cells_of(self, points: Tensor) -> Tensor:
+        """Indices (..., 3) int64, relative to `low`, of the cells that contain points (..., 3), metres."""
+        return (points / self.resolution).floor().long() - self.low
+
+    def flat_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Flat row-major indices (...,) of points (..., 3), 0 where outside; and whether each is inside."""
+        cell = self.cells_of(points)
+        inside = ((cell >= 0) & (cell < self._size)).all(-1)
+        _, ny, nz = self.shape
+        flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
+        return torch.where(inside, flat, 0), inside
+
+    def is_passable(self, points: Tensor) -> Tensor:
+        """Whether the centre of the robot may be at points (..., 3), metres; False outside the map."""
+        flat, inside = self.flat_index(points)
+        return self.passable.view(-1)[flat] & inside
+
+    def centers(self, cells: Tensor) -> Tensor:
+        """Centres (..., 3), metres, of cells (..., 3) relative to `low`."""
+        return (cells + self.low + 0.5).double() * self.resolution
+
+
+def widened(blocked: Tensor, axis: int, cells: int) -> Tensor:
+    """Return cells with a blocked cell within `cells` along an axis; invalid that close to the ends."""
+    size, done = blocked.shape[axis], 0
+    while done < cells:
+        shift = min(2 * done + 1, cells - done)  # 2 · done + 1 cells are covered so far
+        wider = blocked.clone()
+        wider.narrow(axis, shift, size - shift).logical_or_(blocked.narrow(axis, 0, size - shift))
+        wider.narrow(axis, 0, size - shift).logical_or_(blocked.narrow(axis, shift, size - shift))
+        blocked, done = wider, done + shift
+    return blocked
 
 
 def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
@@ -51,7 +119,7 @@ def inflated(blocked: Tensor, radius: float, resolution: float) -> Tensor:
 
 def passable_cells(free: Tensor, radius: float, resolution: float) -> Tensor:
     """Return cells (nx, ny, nz), bool, in which the centre of a robot may be, given the free cells."""
-    return ~inflated(~free, radius + _SPACING / 2 * resolution, resolution)
+    return ~inflated(~free, radius + resolution / 2, resolution)
 
 
 def cells_in_sphere(center: Tensor, radius: float, resolution: float) -> Tensor:
@@ -137,7 +205,7 @@ def feasible(
     begin = start.to(rollout).expand(*rollout.shape[:-2], 7)
     origin = begin[..., :3]
     states = torch.cat([begin[..., None, :], rollout, braking], -2)
-    safe = local_map.is_passable(_points_along(states, _SPACING * local_map.resolution)).all(-1)
+    safe = local_map.is_passable(_points_along(states, local_map.resolution)).all(-1)
     stuck = ~local_map.is_passable(origin)
     safe &= ~stuck
     if radius is not None:
@@ -172,7 +240,7 @@ def feasible_motions(
         follows,
         states,
         ends,
-        _points_of_a_step(longest, turn, spacing_of(local_map)),
+        _points_of_a_step(longest, turn, local_map.resolution),
         min(after, peers.paths.shape[1] - 1),
     )
 
@@ -185,15 +253,10 @@ def free_space(local_map: LocalMap, peers: PeerTrajectories) -> FreeSpace:
     return FreeSpace(passable, local_map.low, nx, ny, nz, side, paths, n_peers, n_times, peers.separation)
 
 
-def spacing_of(local_map: LocalMap) -> float:
-    """Metres between the checked points of a path."""
-    return _SPACING * local_map.resolution
-
-
 def check_steps(primitives: Primitives, local_map: LocalMap) -> None:
     """Raises `InvalidArgumentError` if steps of primitives are too long to be checked in a map's cells."""
     longest, turn = primitives.longest.amax(0).tolist()
-    _points_of_a_step(longest, turn, spacing_of(local_map))
+    _points_of_a_step(longest, turn, local_map.resolution)
 
 
 def _covering_boxes(square: float) -> list[tuple[int, int, int]]:
@@ -276,3 +339,100 @@ def _touched(
     found = cell[row] - low + torch.stack([offset[i] for i in index], 1)
     hit = blocked[found.unbind(1)]
     return row[hit], found[hit]
+
+
+# -- other robots -------------------------------------------------------------------------------------
+
+_MOST_STEPS = 1000  # largest number of steps of a received plan that are used
+
+
+@dataclass(frozen=True, eq=False)
+class PeerTrajectories:
+    """Committed paths of other robots.
+
+    paths: (M, T, 3) float64, metres, world frame: each robot's position after 1, 2, …, T ≥ 1 planner
+    steps. Each robot rests at its last position afterwards.
+    separation: least distance (m) between the centres of two robots: two radii and a margin.
+    """
+
+    paths: Tensor
+    separation: float = 0.7
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.paths.shape)
+        if len(shape) != 3 or shape[1] < 1 or shape[2] != 3 or not bool(torch.isfinite(self.paths).all()):
+            raise InvalidArgumentError(
+                f"paths has shape {shape}; expected finite metres (M, T, 3), T of 1 or more."
+            )
+        check_number("separation", self.separation, above=True)
+
+    @classmethod
+    def of(cls, paths: Sequence[Tensor], separation: float = 0.7) -> PeerTrajectories:
+        """Build from paths (T_i, 3) of any lengths, at least one position each."""
+        longest = max((len(path) for path in paths), default=1)
+        padded = [path[torch.arange(longest).clamp_max(len(path) - 1)] for path in paths]
+        return cls(torch.stack(padded) if padded else torch.zeros(0, 1, 3, dtype=torch.float64), separation)
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def later(self, steps: int) -> PeerTrajectories:
+        """Return the peers as seen by a path that begins that many steps from now."""
+        return PeerTrajectories(self.paths[:, min(steps, self.paths.shape[1] - 1) :], self.separation)
+
+
+def clear_of(path: Tensor, peers: PeerTrajectories, start: Tensor | None = None) -> Tensor:
+    """Flag (...,) the paths (..., L, 3), positions after 1, 2, …, L steps, that keep clear of the peers.
+
+    After step L the robot stays. At step k its distance from another robot must be at least the
+    separation, plus the longer step of that robot before or after step k, plus half of its own longer
+    step. The robots are then also clear between steps, and if the other robot is up to half a step early
+    or late. With `start` (..., 3), the position before the first step, a robot that is already too close
+    may move if it is never closer than it would be by staying.
+    """
+    if len(peers) == 0:
+        return torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)
+    n_path, n_traffic = path.shape[-2], peers.paths.shape[1]
+    # One robot rests after the shorter path ends.
+    n = max(n_path, n_traffic)
+    there = peers.paths[:, torch.arange(n).clamp_max(n_traffic - 1)]
+    least = peers.separation + _longer_step(there)
+    own = path if start is None else torch.cat([start[..., None, :], path], -2)
+    sway = _longer_step(own)[..., own.shape[-2] - n_path :] / 2
+    clear = torch.ones(path.shape[:-2], dtype=torch.bool, device=path.device)
+    for other, needed in zip(there, least, strict=True):
+        ahead, after = other[:n_path], other[n_path:]
+        required = needed[:n_path] + sway
+        if start is not None:
+            required = torch.minimum(required, _distance(start[..., None, :], ahead))
+        clear &= (_distance(path, ahead) >= required).all(-1)
+        if len(after):
+            required = needed[n_path:]
+            if start is not None:
+                required = torch.minimum(required, _distance(start[..., None, :], after))
+            clear &= (_distance(path[..., -1:, :], after) >= required).all(-1)
+    return clear
+
+
+def predicted_path(plan: PlanMessage, age: float, step: float) -> Tensor:
+    """Positions (S, 3), metres, of a teammate after 1, 2, …, S steps of `step` seconds from now, by a plan
+    that was heard `age` seconds ago: on straight lines between the plan's poses, and on the first of these
+    before its first pose."""
+    n = len(plan.path)
+    left = n * plan.step - age
+    ahead = step * torch.arange(1, min(max(math.ceil(left / step - 1e-9), 1), _MOST_STEPS) + 1)
+    at = ((age + ahead.double()) / plan.step - 1).clamp(-1, n - 1)
+    before = at.floor().clamp(0, max(n - 2, 0)).long()
+    path = plan.path[:, :3].double()
+    return torch.lerp(path[before], path[(before + 1).clamp_max(n - 1)], (at - before)[:, None])
+
+
+def _longer_step(path: Tensor) -> Tensor:
+    """Return the longer step, metres (..., L), before or after each position of paths (..., L, 3)."""
+    step = (path[..., 1:, :] - path[..., :-1, :]).norm(dim=-1)
+    pad = torch.nn.functional.pad
+    return torch.maximum(pad(step, (0, 1)), pad(step, (1, 0)))
+
+
+def _distance(a: Tensor, b: Tensor) -> Tensor:
+    return (a - b).norm(dim=-1)

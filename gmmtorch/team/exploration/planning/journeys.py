@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.occupancy import Box
-from gmmtorch.team.exploration.robot.mapper import LocalMap
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 
 if TYPE_CHECKING:
     from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
@@ -310,18 +310,10 @@ def geodesic(
 
 def coarsened(passable: Tensor, coarse: int) -> Tensor:
     """Return coarse cells (⌈n/coarse⌉, …), bool, at least half of which is passable."""
-    if coarse == 1:
-        return passable.clone()
-    count = passable.to(torch.int16)
-    for axis in range(3):
-        short = -count.shape[axis] % coarse
-        if short:
-            shape = list(count.shape)
-            shape[axis] = short
-            count = torch.cat([count, count.new_zeros(shape)], axis)
-        count = count.unflatten(axis, (-1, coarse))
-        count = sum((count.select(axis + 1, i) for i in range(1, coarse)), count.select(axis + 1, 0))
-    return 2 * count >= coarse**3
+    share = torch.nn.functional.avg_pool3d(
+        passable[None].float(), coarse, ceil_mode=True, divisor_override=coarse**3
+    )
+    return share[0] >= 0.5
 
 
 def _wave(open_cells: Tensor, start: Tensor) -> Tensor:

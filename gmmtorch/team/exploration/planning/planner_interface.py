@@ -10,11 +10,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import is_fused
-from gmmtorch.team.exploration.planning.collision_checking import feasible, feasible_motions
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories, clear_of
+from gmmtorch.team.exploration.planning.collision_checking import (
+    LocalMap,
+    PeerTrajectories,
+    clear_of,
+    feasible,
+    feasible_motions,
+)
 from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 from gmmtorch.team.sharing import ViewLibrary
 
 LEAST = 0.05

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap, widened
 from gmmtorch.team.exploration.planning.journeys import COARSE, DistanceField, Journey, angle, looks
 from gmmtorch.team.exploration.planning.planner_interface import Plan, Planner, PlanningTask, Waiting, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
@@ -22,8 +23,6 @@ from gmmtorch.team.exploration.planning.view_evaluator import (
     ViewCache,
     ViewEvaluator,
 )
-from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.exploration.world.navigable import widened
 from gmmtorch.team.sharing import ViewLibrary
 
 _SEARCH = SearchRule(depth=3, n_rounds=2, n_leaves=24)
@@ -366,18 +365,11 @@ class RandomPlanner:
         return Plan(path, braking[0, self._last], path[-1:, :4], 0.0, "explore")
 
 
-PLANNERS = ("mcts", "frontier", "random")
-
-
-def make_planner(name: str, primitives: Primitives, evaluator: ViewEvaluator) -> Planner:
-    """Make the planner `name`, one of `PLANNERS`."""
-    if name == "mcts":
-        return TreePlanner(primitives, evaluator)
-    if name == "frontier":
-        return FrontierPlanner(primitives)
-    if name == "random":
-        return RandomPlanner(primitives)
-    raise InvalidArgumentError(f"planner={name!r} is not one of {', '.join(PLANNERS)}.")
+PLANNERS: dict[str, Callable[[Primitives, ViewEvaluator], Planner]] = {
+    "mcts": TreePlanner,
+    "frontier": lambda primitives, _: FrontierPlanner(primitives),
+    "random": lambda primitives, _: RandomPlanner(primitives),
+}
 
 
 def _rate(found: Found | None) -> float:

@@ -11,11 +11,13 @@ import math
 import torch
 from torch import Tensor
 
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import Library
 from gmmtorch.team.exploration.mission.options import Dynamics
 
 _QUADRATURE = ((0.5 - math.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + math.sqrt(0.15), 5 / 18))
 """Gauss–Legendre nodes and weights on [0, 1]."""
+_ROUNDING = 1e-9
 
 
 class Primitives:
@@ -103,7 +105,40 @@ class Primitives:
 
     def _braking(self, states: Tensor) -> Tensor:
         at_rest = torch.zeros(3, dtype=torch.float64)
-        return _integrated(states, at_rest, self.dynamics, self.dynamics.n_braking_steps)
+        longest = int(_n_ramp_steps(_limits(self.dynamics), self.dynamics).max())
+        return _integrated(states, at_rest, self.dynamics, longest)
+
+
+def _limits(dynamics: Dynamics) -> Tensor:
+    """The largest velocities (3,)."""
+    return torch.tensor([dynamics.speed, dynamics.climb, dynamics.yaw_rate], dtype=torch.float64)
+
+
+def _n_ramp_steps(change: Tensor, dynamics: Dynamics) -> Tensor:
+    """Number of whole steps that changes (..., 3) of the velocities take."""
+    rates = [dynamics.acceleration, dynamics.acceleration, dynamics.yaw_acceleration]
+    per_step = torch.tensor(rates, dtype=torch.float64) * dynamics.step
+    return (change.abs() / per_step - _ROUNDING).ceil()
+
+
+def velocities(dynamics: Dynamics, states: Tensor, commands: Tensor, n_steps: int) -> Tensor:
+    """Return velocities (..., n_steps + 1, 3) from those of states (..., 7) to the commands (..., 3).
+
+    Each velocity changes linearly over the whole steps that the acceleration limit needs, then stays
+    constant. It is therefore linear within every step. Raises `InvalidArgumentError` for states
+    beyond the limits.
+    """
+    now, limits = states[..., 4:], _limits(dynamics)
+    if not bool((now.abs() <= limits * (1 + _ROUNDING)).all()):  # also catches NaN
+        worst = now.reshape(-1, 3).abs().amax(0).tolist()
+        raise InvalidArgumentError(
+            f"states have velocities up to {worst}; speed, climb and yaw_rate allow {limits.tolist()}."
+        )
+    change = commands - now
+    n_ramp = _n_ramp_steps(change, dynamics).clamp_min(1)[..., None, :]
+    time = torch.arange(n_steps + 1, dtype=torch.float64)[:, None]
+    ramp = now[..., None, :] + change[..., None, :] * (time / n_ramp)
+    return torch.where(time < n_ramp, ramp, commands[..., None, :])
 
 
 def _moved(paths: Tensor, states: Tensor) -> Tensor:
@@ -118,7 +153,7 @@ def _moved(paths: Tensor, states: Tensor) -> Tensor:
 def _integrated(states: Tensor, commands: Tensor, dynamics: Dynamics, n_steps: int) -> Tensor:
     """Return states (..., n_steps, 7) while velocities change from states (..., 7) to commands (..., 3)."""
     h = dynamics.step
-    velocity = dynamics.velocities(states.double(), commands, n_steps)
+    velocity = velocities(dynamics, states.double(), commands, n_steps)
     x, y, z, yaw = (states[..., i, None].double() for i in range(4))
     v, climb, turn = velocity.movedim(-1, 0).contiguous()  # each (..., n_steps + 1)
     yaw = yaw + _accumulated((turn[..., :-1] + turn[..., 1:]) * (h / 2))

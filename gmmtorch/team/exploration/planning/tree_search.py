@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import MotionTree, is_fused
-from gmmtorch.team.exploration.planning.collision_checking import check_steps, free_space, spacing_of
+from gmmtorch.team.exploration.planning.collision_checking import check_steps, free_space
 from gmmtorch.team.exploration.planning.journeys import Goal
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask, options
 from gmmtorch.team.exploration.planning.primitives import Primitives
@@ -116,23 +116,25 @@ class _Tree:
     ) -> None:
         self._primitives, self._rule, self._task = primitives, rule, task
         self._memory, self._goal = memory, goal
-        start = task.state.double()
-        most = 1 + rule.depth + rule.n_rounds * rule.n_leaves
-        n_primitives = len(primitives.commands)
+        start, residual = task.state.double(), task.residual
+        if memory is not None:  # the robot has just looked from here, so another look gains nothing
+            residual = memory.marginal(memory.rows(start[None, :4]), residual[None])[1][0]
+        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
+        metres = 0.0 if goal is None else float(goal.cost(start).clamp_max(_FAR))
+        self._begin(1 + rule.depth + rule.n_rounds * rule.n_leaves, residual, feasible, metres)
+
+    def _begin(self, most: int, residual: Tensor, feasible: Tensor, metres: float) -> None:
+        """Make the tables of at most `most` nodes, and the root: what is left of each block (G,), which
+        primitives are feasible (1, P), and the metres to the goal."""
+        start, n_primitives = self._task.state.double(), len(self._primitives)
         self._states = start.expand(most, 7).clone()
         self._ends = start.expand(most, n_primitives, 7).clone()  # end states of the primitives
-        self._metres = torch.zeros(most, dtype=torch.float64)  # remaining to the goal
+        self._metres = torch.full((most,), metres, dtype=torch.float64)  # remaining to the goal
         self._metres_after = torch.zeros(most, n_primitives, dtype=torch.float64)
-        residual = task.residual[None]
-        if memory is not None:  # the robot has just looked from here, so another look gains nothing
-            residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
         self._residuals = residual.expand(most, -1).clone()
         self._scale = 1e-12  # the largest return found
         root = _Node(0, None, -1, 0)
         self._nodes = [root]
-        if goal is not None:
-            self._metres[0] = goal.cost(start).clamp_max(_FAR)
-        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
         self._open([root], self._paths[:, :, -1], feasible)
 
     def grow(self, first: Sequence[int]) -> None:
@@ -255,32 +257,20 @@ class _Tree:
             node.untried, node.closed = actions[:n], n == 0
 
 
-class _FusedTree:
+class _FusedTree(_Tree):
     """The tree of one search in the tables of fused kernels; `_Tree` is its twin."""
 
-    def __init__(
-        self,
-        primitives: Primitives,
-        rule: SearchRule,
-        task: PlanningTask,
-        memory: ViewCache | None,
-        goal: Goal | None,
-    ) -> None:
-        check_steps(primitives, task.local_map)
-        self._primitives, self._rule, self._task = primitives, rule, task
-        self._memory, self._goal = memory, goal
-        start, residual = task.state.double(), task.residual[None]
-        if memory is not None:
-            residual = memory.marginal(memory.rows(start[None, :4]), residual)[1]
-        self._paths, self._braking, feasible = options(primitives, start[None], task, may_escape=True)
-        self._space, self._spacing = free_space(task.local_map, task.peers), spacing_of(task.local_map)
+    def _begin(self, most: int, residual: Tensor, feasible: Tensor, metres: float) -> None:
+        task, rule, goal = self._task, self._rule, self._goal
+        check_steps(self._primitives, task.local_map)
+        self._space = free_space(task.local_map, task.peers)
         self._tree = MotionTree(
-            1 + rule.depth + rule.n_rounds * rule.n_leaves,
-            start,
+            most,
+            task.state.double(),
             self._paths[0, :, -1],
             feasible[0],
-            residual[0],
-            0.0 if goal is None else float(goal.cost(start).clamp_max(_FAR)),
+            residual,
+            metres,
             deepest=rule.depth,
             exploration=rule.exploration,
             widening=_WIDENING,
@@ -320,7 +310,15 @@ class _FusedTree:
             rows = self._memory.rows(tree.states[tree.n_nodes - n : tree.n_nodes, :4])
             views = rows, *self._memory.tables
         primitives = self._primitives
-        tree.open(primitives.library, self._space, primitives.longest, self._spacing, n, is_last, views)
+        tree.open(
+            primitives.library,
+            self._space,
+            primitives.longest,
+            self._space.resolution,
+            n,
+            is_last,
+            views,
+        )
         return self._orders()
 
     def _orders(self) -> Tensor:

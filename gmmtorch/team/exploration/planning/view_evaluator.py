@@ -13,29 +13,11 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.kernels import Beams, Cells, information_by_block
 from gmmtorch.occupancy import check_resolution
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
-from gmmtorch.team.exploration.robot.mapper import LocalMap
 
 _MOST_CELLS = 1 << 22
 _NEGLIGIBLE = 1e-5  # values of the depth kernel below this count as zero
-
-
-class BeamTemplates(NamedTuple):
-    """Y headings, B beams each, up to C cells a beam, from a camera at the centre of its cell.
-
-    offsets: (Y, B, C, 3) int64, lattice cells relative to the camera's cell, in order; zeros beyond the end.
-    depths: (Y, B, C), metres along the beam to the middle of its way through each cell.
-    volumes: (Y, B, C), volume of the beam's pencil inside each cell, in cells. It sums to about one over
-        the beams that share a cell, so a sum over beams weighted by it is a sum over cells.
-    lengths: (Y, B) int64, number of cells of each beam.
-    leading: (Y, B, 3, K) int64, number of a beam's cells before its offset on an axis exceeds k.
-    """
-
-    offsets: Tensor
-    depths: Tensor
-    volumes: Tensor
-    lengths: Tensor
-    leading: Tensor
 
 
 def beam_templates(
@@ -45,11 +27,20 @@ def beam_templates(
     resolution: float,
     n_beams: int,
     n_yaws: int,
-) -> BeamTemplates:
-    """Compute templates of a pinhole camera that looks along its heading with pitch 0; yaw k is 2πk/n_yaws.
+) -> tuple[Tensor, ...]:
+    """Templates of a pinhole camera that looks along its heading with pitch 0, from the centre of its cell: Y
+    headings, yaw k is 2πk/n_yaws; B beams each, up to C cells a beam.
 
     horizontal_fov, vertical_fov: radians, each in (0, π). max_range: metres along the beam. resolution: side
     (m) of the cells. n_beams: approximate number of beams; rows and columns are evenly spaced.
+
+    Returns:
+        (Y, B, C, 3) int64, lattice cells relative to the camera's cell, in order; zeros beyond the end;
+        (Y, B, C), metres along the beam to the middle of its way through each cell;
+        (Y, B, C), volume of the beam's pencil inside each cell, in cells. It sums to about one over the beams
+        that share a cell, so a sum over beams weighted by it is a sum over cells;
+        (Y, B) int64, number of cells of each beam;
+        (Y, B, 3, K) int64, number of a beam's cells before its offset on an axis exceeds k.
     """
     directions, solid_angles = pinhole_beams(horizontal_fov, vertical_fov, n_beams)
     if not 0 < max_range < math.inf:
@@ -73,7 +64,7 @@ def beam_templates(
     away = torch.where(exists[..., None], offsets.abs(), farthest + 1).movedim(3, 2).contiguous()
     steps = torch.arange(farthest + 1).expand(*away.shape[:3], -1).contiguous()
     leading = torch.searchsorted(away, steps, right=True)  # offsets only grow along a beam
-    return BeamTemplates(offsets, depths, volumes, lengths, leading)
+    return offsets, depths, volumes, lengths, leading
 
 
 def pinhole_beams(horizontal_fov: float, vertical_fov: float, n_beams: int) -> tuple[Tensor, Tensor]:
@@ -216,21 +207,21 @@ class ViewEvaluator:
         self.stride = check_whole("stride", stride, 1)
         self.information = information
         self.device = torch.device(device)
-        templates = beam_templates(
+        offsets, depths, volumes, lengths, leading = beam_templates(
             horizontal_fov, vertical_fov, max_range, self.resolution, n_beams, self.n_yaws
         )
-        self.n_beams, n_cells = templates.depths.shape[1:]
-        self._offsets = templates.offsets.to(device)
-        self._exists = (torch.arange(n_cells) < templates.lengths[..., None]).to(device)
-        depths = torch.where(self._exists.cpu(), templates.depths, math.inf)
-        band = needed_band(depths, _SIGMA)
-        kernel = depth_kernel(templates.depths, _SIGMA, band, templates.lengths).float().flatten(1, 2)
+        self.n_beams, n_cells = depths.shape[1:]
+        self._offsets = offsets.to(device)
+        exists = torch.arange(n_cells) < lengths[..., None]
+        self._exists = exists.to(device)
+        band = needed_band(torch.where(exists, depths, math.inf), _SIGMA)
+        kernel = depth_kernel(depths, _SIGMA, band, lengths).float().flatten(1, 2)
         self._beams = Beams(
             self.n_beams,
-            templates.lengths.flatten().to(device),
-            templates.leading.movedim(2, 0).flatten(1, 2).contiguous().to(device),
-            (templates.offsets > 0).any(2).movedim(2, 0).flatten(1, 2).contiguous().to(device),
-            _with_end(templates.volumes.float()).flatten(0, 1).to(device),
+            lengths.flatten().to(device),
+            leading.movedim(2, 0).flatten(1, 2).contiguous().to(device),
+            (offsets > 0).any(2).movedim(2, 0).flatten(1, 2).contiguous().to(device),
+            _with_end(volumes.float()).flatten(0, 1).to(device),
             kernel.to(device),
         )
         self._empty: Cells | None = None  # of the last shape

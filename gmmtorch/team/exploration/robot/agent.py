@@ -12,8 +12,7 @@ from torch import Tensor
 from gmmtorch.simulation import DepthFrame, MeshWorld
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import StoppingRule, TeamOptions
-from gmmtorch.team.exploration.planning.collision_checking import local_map_of
-from gmmtorch.team.exploration.planning.coordination import PeerTrajectories
+from gmmtorch.team.exploration.planning.collision_checking import LocalMap, PeerTrajectories, local_map_of
 from gmmtorch.team.exploration.planning.journeys import Roadmap
 from gmmtorch.team.exploration.planning.planner_interface import (
     Plan,
@@ -25,7 +24,7 @@ from gmmtorch.team.exploration.planning.planner_interface import (
 )
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.robot.mapper import FrameUpdate, LocalMap, Mapper, Memo
+from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.sharing import (
     MAX_BYTES,
@@ -111,13 +110,12 @@ class Robot:
         pose: Tensor,
         mapper: Mapper,
         planner: Planner,
-        library: ViewLibrary,
-        roadmap: Roadmap,
         start: InitialFreeSpace,
         rest: StoppingRule,
+        incarnation: int = 0,
     ) -> None:
-        self.number = number
-        self.mapper, self.planner, self.library, self.roadmap = mapper, planner, library, roadmap
+        self.number, self.mapper, self.planner = number, mapper, planner
+        self.library, self.roadmap = ViewLibrary(number, incarnation=incarnation), Roadmap()
         self.state = torch.cat([pose.double(), torch.zeros(3, dtype=torch.float64)])
         self.path = self.state[None].clone()
         self.braking = self.state[None].clone()

@@ -7,22 +7,19 @@ unit cube by a hash of the component's id (Cranley and Patterson 1976), and tran
 truncated at the radius `cutoff` (deviations). The rays of a component therefore depend only on the component,
 and the rays of several batches can be added or removed one by one.
 
-`component_evidence` counts these rays in the cells of a box; `MixtureTiles` finds the batches of components
-whose rays may reach it.
+`component_evidence` counts these rays in the cells of a box.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import THINNING, Seen, cast_components, hidden_area, is_fused, truncated_normals
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping import Components
@@ -30,10 +27,7 @@ from gmmtorch.occupancy import (
     Box,
     CellEvidence,
     RayBundle,
-    RollingWindow,
     cast_evidence,
-    check_resolution,
-    cone_bounds,
     intersection,
     near_interval,
     sum_evidence,
@@ -41,33 +35,42 @@ from gmmtorch.occupancy import (
 )
 
 
-class _Counting(NamedTuple):
-    """How rays are counted, see `component_evidence`."""
-
-    shell: float
-    hits_per_ray: int
-    thinned: bool
-
-
 @dataclass(frozen=True)
-class RayDensity:
-    """The density of rays.
+class RayRule:
+    """How many rays components have, and how these are counted in cells of side `resolution` (m).
 
-    resolution: side (m) of the cells. least, most: bounds on the number of rays of a viewpoint.
+    rays_per_cell: of a viewpoint, for each cell that its component hides; `least` to `most` in all.
+    cutoff: radius (deviations) at which draws are truncated.
+    empty_rays_per_cell, empty_cutoff: the same of components of no-return beams; None: as the others.
+    shell: cells. Within this distance of its component's surface a ray adds no misses. Otherwise rays at flat
+        angles add misses to the cells that contain the surface, and most cells of a floor become free. 0
+        is the thesis's choice.
+    hits_per_ray: number of points drawn for each ray. Points are cheap compared with ray traversal, and the
+        hits, few for each cell, are the noisy part.
+    thinned: in the first half of the way, follow only a quarter of a viewpoint's rays, with four times the
+        weight. Rays converge toward the sensor, so they are as dense there as at the end, at half the work.
     """
 
     resolution: float
-    rays_per_cell: float
-    least: int
-    most: int
-    cutoff: float
+    rays_per_cell: float = 4.0
+    least: int = 8
+    most: int = 512
+    cutoff: float = 2.5
+    empty_rays_per_cell: float | None = None
+    empty_cutoff: float | None = None
+    shell: float = 0.0
+    hits_per_ray: int = 1
+    thinned: bool = False
 
-    def __post_init__(self) -> None:
-        check_resolution(self.resolution)
-        for name in ("rays_per_cell", "cutoff"):
-            check_number(name, getattr(self, name), above=True)
-        if check_whole("most", self.most, 1) < check_whole("least", self.least, 1):
-            raise InvalidArgumentError(f"most={self.most} must be at least least={self.least}.")
+    @property
+    def of_empty(self) -> RayRule:
+        """The rule of components of no-return beams."""
+        rays, cutoff = self.empty_rays_per_cell, self.empty_cutoff
+        return replace(
+            self,
+            rays_per_cell=self.rays_per_cell if rays is None else rays,
+            cutoff=self.cutoff if cutoff is None else cutoff,
+        )
 
 
 def counted_viewpoints(components: Components, resolution: float) -> Tensor:
@@ -79,17 +82,17 @@ def counted_viewpoints(components: Components, resolution: float) -> Tensor:
     return (components.seen_count > 0).nonzero().squeeze(1)
 
 
-def ray_numbers(components: Components, seen: Tensor, density: RayDensity) -> Tensor:
+def ray_numbers(components: Components, seen: Tensor, rule: RayRule) -> Tensor:
     """Number of rays (C,) of each of the viewpoints `seen` (C,)."""
     by, viewpoint = components.seen_by[seen], components.seen_from[seen]
     toward = components.means[by].double() - components.origins[viewpoint].double()
-    hidden = hidden_area(toward, components.covariances[by].double()) / density.resolution**2
-    wanted = (density.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused when rays are drawn
-    return wanted.clamp(density.least, density.most).long()
+    hidden = hidden_area(toward, components.covariances[by].double()) / rule.resolution**2
+    wanted = (rule.rays_per_cell * hidden).ceil().nan_to_num(0)  # NaN is refused when rays are drawn
+    return wanted.clamp(rule.least, rule.most).long()
 
 
 def drawn_rays(
-    components: Components, seen: Tensor, density: RayDensity, once: Tensor, times: Tensor
+    components: Components, seen: Tensor, rule: RayRule, once: Tensor, times: Tensor
 ) -> tuple[RayBundle, Tensor, Tensor]:
     """`times` · `once` rays of each viewpoint `seen` (C,); the viewpoint (R,) of each ray; and the rows
     (F,) of the first `once` rays of each viewpoint."""
@@ -105,8 +108,8 @@ def drawn_rays(
     first = torch.cumsum(number, 0) - number
     draw = torch.arange(len(viewpoint), device=seen.device) - first[viewpoint]
     component = by[viewpoint]
-    longest = density.most * (int(times.max()) if len(times) else 1)
-    normal = truncated_normals(components.ids[used], component, draw, longest, density.cutoff)
+    longest = rule.most * (int(times.max()) if len(times) else 1)
+    normal = truncated_normals(components.ids[used], component, draw, longest, rule.cutoff)
     # Sums and products of single columns: a matrix product may round differently in another batch.
     ends = []
     for row in range(3):
@@ -128,99 +131,52 @@ _FARTHEST = 2.0**31  # cells from the world's origin
 _MOST_CELLS = 1 << 23  # of the window of the fused kernel, 16 bytes each
 
 
-def component_evidence(
-    components: Components,
-    resolution: float,
-    box: Box,
-    *,
-    rays_per_cell: float = 4.0,
-    least: int = 8,
-    most: int = 512,
-    cutoff: float = 2.5,
-    shell: float = 0.0,
-    hits_per_ray: int = 1,
-    thinned: bool = False,
-    empty_rays_per_cell: float | None = None,
-    empty_cutoff: float | None = None,
-) -> CellEvidence:
+def component_evidence(components: Components, box: Box, rule: RayRule) -> CellEvidence:
     """Evidence of components in the cells of a box, from their rays.
 
     Viewpoints whose rays cannot reach the box are skipped, which does not change the result. Rays are
-    drawn in portions, which bounds the memory.
-
-    rays_per_cell, least, most, cutoff: see `component_rays`.
-    shell: cells. Within this distance of its component's surface a ray adds no misses. Otherwise rays at flat
-        angles add misses to the cells that contain the surface, and most cells of a floor become free. 0
-        is the thesis's choice.
-    hits_per_ray: number of points drawn for each ray. Points are cheap compared with ray traversal, and the
-        hits, few for each cell, are the noisy part.
-    thinned: in the first half of the way, follow only a quarter of a viewpoint's rays, with four times the
-        weight. Rays converge toward the sensor, so they are as dense there as at the end, at half the work.
-    empty_rays_per_cell, empty_cutoff: `rays_per_cell` and `cutoff` of components of no-return beams, if they
-        differ.
+    drawn in portions, which bounds the memory. Raises `InvalidArgumentError` for components that are not in
+    3D, or that are no place of the lattice.
     """
-    check_whole("hits_per_ray", hits_per_ray, 1)
-    if not 0 <= shell < math.inf:
-        raise InvalidArgumentError(f"shell={shell} must be finite, at least zero cells.")
-    how = _Counting(shell, hits_per_ray, thinned)
-    density = RayDensity(resolution, rays_per_cell, least, most, cutoff)
-    of_empty = RayDensity(
-        resolution,
-        rays_per_cell if empty_rays_per_cell is None else empty_rays_per_cell,
-        least,
-        most,
-        cutoff if empty_cutoff is None else empty_cutoff,
-    )
-    seen = counted_viewpoints(components, resolution)
+    seen = counted_viewpoints(components, rule.resolution)
     if is_fused(components.means, box.low):
-        found = _fused(components, seen, box, (density, of_empty), how)
+        found = _fused(components, seen, box, rule)
         if found is not None:
             return found
-    if density == of_empty:
-        return _drawn(components, seen, box, density, how)
+    of_empty = rule.of_empty
+    if rule == of_empty:
+        return _drawn(components, seen, box, rule)
     is_empty = components.max_range[components.seen_by[seen]]
     return sum_evidence(
-        _drawn(components, seen[chosen], box, each, how)
-        for chosen, each in ((~is_empty, density), (is_empty, of_empty))
+        _drawn(components, seen[chosen], box, each)
+        for chosen, each in ((~is_empty, rule), (is_empty, of_empty))
     )
 
 
-def _drawn(
-    components: Components,
-    seen: Tensor,
-    box: Box,
-    density: RayDensity,
-    how: _Counting,
-) -> CellEvidence:
+def _drawn(components: Components, seen: Tensor, box: Box, rule: RayRule) -> CellEvidence:
     """`component_evidence` of the viewpoints `seen` (C,), from a list of their rays."""
-    seen = seen[_in_reach(components, seen, box, density)]
+    seen = seen[_in_reach(components, seen, box, rule)]
     # If a component's points cannot be in the box, only its passing rays matter.
     ends_here = (
-        _in_reach(components, seen, box, density, ends_only=True)
+        _in_reach(components, seen, box, rule, ends_only=True)
         & ~components.max_range[components.seen_by[seen]]
     )
-    times = torch.where(ends_here, how.hits_per_ray, 1)
-    number = ray_numbers(components, seen, density)
+    times = torch.where(ends_here, rule.hits_per_ray, 1)
+    number = ray_numbers(components, seen, rule)
     parts = [
-        _evidence(components, seen[some], box, density, number[some], times[some], how)
+        _evidence(components, seen[some], box, rule, number[some], times[some])
         for some in _portions(number * times)
     ]
     return parts[0] if len(parts) == 1 else sum_evidence(parts)
 
 
-def _fused(
-    components: Components,
-    seen: Tensor,
-    box: Box,
-    densities: tuple[RayDensity, RayDensity],
-    how: _Counting,
-) -> CellEvidence | None:
+def _fused(components: Components, seen: Tensor, box: Box, rule: RayRule) -> CellEvidence | None:
     """`component_evidence` by the fused kernel; None for input that the twin corrects, refuses or splits."""
     if len(seen) == 0:
         return CellEvidence.empty(seen.device)
-    density, of_empty = densities
-    cutoff = torch.where(components.max_range, of_empty.cutoff, density.cutoff)
-    extent = _extent(components, seen, cutoff, density.resolution)
+    of_empty = rule.of_empty
+    cutoff = torch.where(components.max_range, of_empty.cutoff, rule.cutoff)
+    extent = _extent(components, seen, cutoff, rule.resolution)
     if extent is None:
         return None
     window = intersection(box, extent)
@@ -237,14 +193,14 @@ def _fused(
         components.ids,
         Seen(components.seen_by[seen], components.seen_from[seen], count),
         torch.stack([*box, *window]).double(),
-        resolution=density.resolution,
-        rays_per_cell=(density.rays_per_cell, of_empty.rays_per_cell),
-        least=density.least,
-        most=density.most,
-        cutoff=(density.cutoff, of_empty.cutoff),
-        shell=how.shell * density.resolution,
-        hits_per_ray=how.hits_per_ray,
-        thinned=how.thinned,
+        resolution=rule.resolution,
+        rays_per_cell=(rule.rays_per_cell, of_empty.rays_per_cell),
+        least=rule.least,
+        most=rule.most,
+        cutoff=(rule.cutoff, of_empty.cutoff),
+        shell=rule.shell * rule.resolution,
+        hits_per_ray=rule.hits_per_ray,
+        thinned=rule.thinned,
     )
     return None if found is None else CellEvidence.from_dense(window.low, *found)
 
@@ -278,29 +234,24 @@ def _portions(draws: Tensor) -> Iterator[slice]:
 
 
 def _evidence(
-    components: Components,
-    seen: Tensor,
-    box: Box,
-    density: RayDensity,
-    number: Tensor,
-    times: Tensor,
-    how: _Counting,
+    components: Components, seen: Tensor, box: Box, rule: RayRule, number: Tensor, times: Tensor
 ) -> CellEvidence:
     """`component_evidence` of the viewpoints `seen` (C,), with `number` (C,) rays and `times` as many
     hits.
     """
-    resolution = density.resolution
-    drawn, viewpoint, followed = drawn_rays(components, seen, density, number, times)
+    drawn, viewpoint, followed = drawn_rays(components, seen, rule, number, times)
     rays, viewpoint = RayBundle(*(field[followed] for field in drawn)), viewpoint[followed]
     stops, weights = rays.ends, rays.weights * times[viewpoint]
-    if how.shell > 0:
-        stops = _before_surface(components, components.seen_by[seen][viewpoint], rays, how.shell * resolution)
+    if rule.shell > 0:
+        stops = _before_surface(
+            components, components.seen_by[seen][viewpoint], rays, rule.shell * rule.resolution
+        )
     starts = rays.origins
-    if how.thinned:
+    if rule.thinned:
         starts, stops, weights = _thinned(starts, stops, weights, viewpoint)
     passing = torch.zeros_like(weights, dtype=torch.bool)
     struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
-    return cast_evidence(starts, stops, passing, resolution, box, weights, hit_places=struck)
+    return cast_evidence(starts, stops, passing, rule.resolution, box, weights, hit_places=struck)
 
 
 def _thinned(
@@ -337,101 +288,14 @@ def _before_surface(components: Components, of: Tensor, rays: RayBundle, distanc
 
 
 def _in_reach(
-    components: Components, seen: Tensor, box: Box, density: RayDensity, ends_only: bool = False
+    components: Components, seen: Tensor, box: Box, rule: RayRule, ends_only: bool = False
 ) -> Tensor:
     """Which of the viewpoints `seen` (C,) may have rays that reach the box, or that end in it."""
     by = components.seen_by[seen]
-    spread = density.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
+    spread = rule.cutoff * components.covariances.double().diagonal(dim1=1, dim2=2).sqrt()
     low, high = components.means.double() - spread, components.means.double() + spread
     origins = components.origins.double()[components.seen_from[seen]]
-    scale = 1 / density.resolution
+    scale = 1 / rule.resolution
     # The margin of half a cell covers the rounding of the draws.
     first, last = near_interval(origins * scale, low[by] * scale, high[by] * scale, box)
     return (first <= last) & (last >= 1) if ends_only else first <= last
-
-
-_REACH = 3.0  # deviations around the means that belong to the box
-_MOST_TILES = 4096  # a batch in more tiles is tested in every search
-
-
-class MixtureTiles:
-    """Batches of components, each of one message or frame, hashed into cubes by the box around their rays.
-
-    The time of a search grows with the number of near batches, not of all. Batches never change.
-
-    Args:
-        tile: side (m) of the cubes.
-    """
-
-    def __init__(self, tile: float = 8.0) -> None:
-        if not 0 < tile < math.inf:
-            raise InvalidArgumentError(f"tile={tile} must be finite metres above zero.")
-        self.tile = tile
-        self._batches: list[tuple[Components, list[float], list[float]]] = []
-        """With the corners of the box around their rays, metres."""
-        self._tiles: dict[tuple[int, ...], list[int]] = {}  # rows of the batches in each cube
-        self._everywhere: list[int] = []
-
-    def add(self, components: Components) -> None:
-        """Adds a batch. Raises `InvalidArgumentError` for components that are not in 3D, and means,
-        covariances or origins that are not finite."""
-        if components.dim != 3:
-            raise InvalidArgumentError(f"components have {components.dim} dimensions; tiles need 3.")
-        if not len(components.seen_by):
-            return  # it has no rays
-        lows, highs = cone_bounds(components.cones(), _REACH)
-        low, high = lows.amin(0).tolist(), highs.amax(0).tolist()
-        if not all(map(math.isfinite, (*low, *high))):
-            raise InvalidArgumentError("The components of a batch hold NaN or infinite values.")
-        spans = self._spans(low, high)
-        if math.prod(map(len, spans)) > _MOST_TILES:
-            self._everywhere.append(len(self._batches))
-        else:
-            for place in itertools.product(*spans):
-                self._tiles.setdefault(place, []).append(len(self._batches))
-        self._batches.append((components, low, high))
-
-    def near(self, box: Box, resolution: float) -> list[Components]:
-        """Batches whose rays may reach a box of cells of side `resolution` (m), in the order of `add`.
-
-        Rays must end within three deviations of their means, as those of `component_rays` do.
-        """
-        low = [x * resolution for x in box.low.tolist()]
-        high = [x * resolution for x in box.high.tolist()]
-        spans = self._spans(low, high)
-        found = set(self._everywhere)
-        if math.prod(map(len, spans)) < len(self._tiles):
-            for place in itertools.product(*spans):
-                found.update(self._tiles.get(place, ()))
-        else:  # the box has more tiles than are in use
-            for place, numbers in self._tiles.items():
-                if all(x in span for x, span in zip(place, spans, strict=True)):
-                    found.update(numbers)
-        batches = [self._batches[number] for number in sorted(found)]
-        return [
-            components
-            for components, first, last in batches
-            if all(a <= d and c <= b for a, b, c, d in zip(first, last, low, high, strict=True))
-        ]
-
-    def _spans(self, low: list[float], high: list[float]) -> list[range]:
-        """The tiles along each axis from one corner to the other, metres."""
-        return [
-            range(math.floor(a / self.tile), math.floor(b / self.tile) + 1)
-            for a, b in zip(low, high, strict=True)
-        ]
-
-
-def regenerate(
-    sliding: RollingWindow,
-    boxes: Iterable[Box],
-    tiles: MixtureTiles,
-    evidence: Callable[[Components, float, Box], CellEvidence],
-) -> None:
-    """Fills empty boxes that the window has uncovered with the evidence of the mixture (thesis Fig 4.2).
-
-    Rays are clipped to the boxes, so nothing is counted twice. `evidence(components, resolution, box)`.
-    """
-    for box in boxes:
-        if near := tiles.near(box, sliding.resolution):
-            sliding.add(evidence(Components.concatenate(near), sliding.resolution, box))

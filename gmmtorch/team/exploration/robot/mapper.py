@@ -1,21 +1,36 @@
-"""Mapper: the interface between a robot and its map; LocalMap, which its planner reads; and voxel maps."""
+"""Mapper: the interface between a robot and its map; maps of voxels, and of mixtures."""
 
 from __future__ import annotations
 
+import hashlib
+import itertools
+import operator
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import replace
 from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import check_whole
-from gmmtorch.mapping import Components, NoveltyRule, beam_novelty
-from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence
+from gmmtorch.mapping import (
+    Components,
+    NoveltyRule,
+    all_origins,
+    beam_novelty,
+    box_around,
+    count_explained,
+    explained_within,
+    fit_window,
+    summed,
+)
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence, cone_bounds, intersection
+from gmmtorch.scan import Scan
 from gmmtorch.simulation import DepthFrame
+from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration.robot.component_rays import RayRule, component_evidence
 from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.sharing import (
     Broadcast,
@@ -26,60 +41,6 @@ from gmmtorch.team.sharing import (
     SharedPoints,
     decode,
 )
-
-
-@dataclass(frozen=True, eq=False)
-class LocalMap:
-    """A dense snapshot (nx, ny, nz) of the cells of the sliding map.
-
-    low: (3,) int64, index of the lowest cell; cell c is [c, c + 1) · resolution, world frame.
-    resolution: side (m) of the cells.
-    occupancy: (nx, ny, nz) float32, with the planner's prior where nothing was observed.
-    observed: bool, cells with any evidence.
-    free: bool, known to be free.
-    passable: bool, where the centre of the robot may be: all cells that its body touches are free.
-    """
-
-    low: Tensor
-    resolution: float
-    occupancy: Tensor
-    observed: Tensor
-    free: Tensor
-    passable: Tensor
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(self.free.shape)
-
-    @property
-    def box(self) -> Box:
-        return Box(self.low, self.low + torch.tensor(self.shape))
-
-    @cached_property
-    def _size(self) -> Tensor:
-        return torch.tensor(self.shape)
-
-    def cells_of(self, points: Tensor) -> Tensor:
-        """Indices (..., 3) int64, relative to `low`, of the cells that contain points (..., 3), metres."""
-        return (points / self.resolution).floor().long() - self.low
-
-    def flat_index(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Flat row-major indices (...,) of points (..., 3), 0 where outside; and whether each is inside."""
-        cell = self.cells_of(points)
-        inside = ((cell >= 0) & (cell < self._size)).all(-1)
-        _, ny, nz = self.shape
-        flat = (cell[..., 0] * ny + cell[..., 1]) * nz + cell[..., 2]
-        return torch.where(inside, flat, 0), inside
-
-    def is_passable(self, points: Tensor) -> Tensor:
-        """Whether the centre of the robot may be at points (..., 3), metres; False outside the map."""
-        flat, inside = self.flat_index(points)
-        return self.passable.view(-1)[flat] & inside
-
-    def centers(self, cells: Tensor) -> Tensor:
-        """Centres (..., 3), metres, of cells (..., 3) relative to `low`."""
-        return (cells + self.low + 0.5).double() * self.resolution
-
 
 T = TypeVar("T")
 
@@ -127,7 +88,6 @@ class Mapper(ABC):
 
     Args:
         local: the window. belief: the map of the world, which the evaluator reads.
-        width: of the camera's images, pixels. novelty: when a beam is novel.
         memo: cache of evidence; shared by the robots of a simulation.
 
     Attributes:
@@ -136,11 +96,9 @@ class Mapper(ABC):
 
     shared: Replica | Broadcast | SharedPoints
 
-    def __init__(
-        self, local: RollingWindow, belief: BeliefMap, width: int, novelty: NoveltyRule, memo: Memo
-    ) -> None:
+    def __init__(self, local: RollingWindow, belief: BeliefMap, options: TeamOptions, memo: Memo) -> None:
         self.local, self.belief = local, belief
-        self._width, self._novelty, self._memo = width, novelty, memo
+        self._width, self._novelty, self._memo = options.camera.width, options.novelty, memo
 
     @abstractmethod
     def center_on(self, position: Tensor) -> None:
@@ -199,8 +157,7 @@ class GridMapper(Mapper):
     The grid behind the window is `belief.grid`.
 
     Args:
-        robot: its id. shares: whether the robot sends its novel points. size: robots of the team.
-        decode: turns a datagram into a message; a memo's, where robots share one.
+        robot: its id. decode: turns a datagram into a message; a cached one, where robots share the work.
     """
 
     shared: SharedPoints
@@ -210,16 +167,13 @@ class GridMapper(Mapper):
         robot: int,
         local: RollingWindow,
         belief: BeliefMap,
-        width: int,
-        novelty: NoveltyRule,
+        options: TeamOptions,
         memo: Memo,
-        shares: bool,
-        size: int,
         decode: Callable[[bytes], Message] = decode,
     ) -> None:
-        super().__init__(local, belief, width, novelty, memo)
-        self.shared = SharedPoints(robot, size)
-        self._shares, self._decode = shares, decode
+        super().__init__(local, belief, options, memo)
+        self.shared = SharedPoints(robot, options.size)
+        self._shares, self._decode = options.shares, decode
 
     def center_on(self, position: Tensor) -> None:
         for box in self.local.center_on(position):
@@ -264,3 +218,228 @@ class GridMapper(Mapper):
             return cast_evidence(origin, ends, is_hit, grid.resolution, grid.box)
 
         return self._memo(tuple(datagrams), make)
+
+
+# -- mixtures -----------------------------------------------------------------------------------------
+
+_LEEWAY = 0.5  # cells
+_EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
+_EMPTY_CUTOFF = 2.0
+"""Mahalanobis distance. Tails of components of free space reach through surfaces that beams just missed."""
+
+
+_REACH = 3.0  # deviations around the means in which the rays of components end
+
+
+class _Boxes:
+    """Batches of components, each with the box (2, 3) around its rays, or around what it explains, metres."""
+
+    def __init__(self) -> None:
+        self._batches: list[Components] = []
+        self._corners = torch.zeros(0, 2, 3, dtype=torch.float64)
+
+    def add(self, batch: Components, low: Tensor, high: Tensor) -> None:
+        """Adds a batch of K parts with boxes from `low` to `high`, (K, 3)."""
+        self._batches.append(batch)
+        corners = torch.stack([low.amin(0), high.amax(0)])[None]
+        self._corners = torch.cat([self._corners.to(corners), corners])
+
+    def near(self, low: Tensor, high: Tensor) -> list[Components]:
+        """The batches whose box meets that from `low` to `high`, (3,), in the order of `add`."""
+        first, last = self._corners.unbind(1)
+        meets = ((first <= high.to(first)) & (last >= low.to(last))).all(1)
+        return [self._batches[row] for row in meets.nonzero().squeeze(1).tolist()]
+
+
+class GmmMapper(Mapper):
+    """The map of one robot of a team that learns mixtures from novel beams and shares them (thesis Fig 4.1).
+
+    Components are immutable; points that they explain later become counts, which any robot may add. All
+    robots, the owner included, hold components as they are decoded from datagrams, so all maps are equal to
+    the bit. The voxels follow the mixture: each change of the mixture is cast into them once.
+
+    Args:
+        shared: the empty mixture; a `Replica`, or a `Broadcast` for codecs other than "quantized".
+    """
+
+    shared: Replica | Broadcast
+
+    def __init__(
+        self,
+        local: RollingWindow,
+        belief: BeliefMap,
+        options: TeamOptions,
+        memo: Memo,
+        shared: Replica | Broadcast,
+    ) -> None:
+        super().__init__(local, belief, options, memo)
+        self.shared = shared
+        self._rule = rule = options.frame
+        self._rays = RayRule(
+            local.resolution,
+            rays_per_cell=rule.rays,
+            empty_rays_per_cell=_EMPTY_RAYS * rule.rays,
+            empty_cutoff=_EMPTY_CUTOFF,
+            shell=rule.shell,
+            hits_per_ray=rule.hits_per_ray,
+            thinned=True,
+        )
+        self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
+        self._due: dict[tuple[int, int], float] = {}  # counts that are sent with the next message
+        self._n_frames = 0
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forgets where batches are."""
+        self._by_rays, self._by_explained = _Boxes(), _Boxes()
+        self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
+        self._near: tuple[list[Components], Components] | None = None  # the last `_seen_from_near`
+
+    # -- sensing ----------------------------------------------------------------------------------
+
+    def center_on(self, position: Tensor) -> None:
+        for uncovered in self.local.center_on(position):
+            box, side = intersection(uncovered, self.belief.grid.box), self.local.resolution
+            # Rays are clipped to the uncovered cells, so nothing is counted twice (thesis Fig 4.2).
+            if box is not None and (near := self._by_rays.near(*(side * corner.double() for corner in box))):
+                self.local.add(component_evidence(Components.concatenate(near), box, self._rays))
+
+    def sense(self, frame: DepthFrame) -> FrameUpdate:
+        rule = self._rule
+        novel = learned = self._novel(frame)
+        if rule.update_novel:
+            learned = novel & ~self._count(frame, novel.nonzero().squeeze(1), 1)
+        if rule.update_stride is not None:
+            self._count(frame, (~novel).nonzero().squeeze(1)[:: rule.update_stride], rule.update_stride)
+        components = self._learned(frame, learned)
+        self.shared.add(components.to("cpu"))  # where messages are encoded
+        self._n_frames += 1
+        if self._n_frames % rule.update_every == 0:
+            self.shared.count(self._due)
+            self._due = {}
+        return FrameUpdate(self._follow(), novel)
+
+    def _novel(self, frame: DepthFrame) -> Tensor:
+        """Which beams (N,) of a frame are novel."""
+        rule = self._rule
+        # Components do not count cells close to surfaces as free: this must not make beams novel.
+        short = (rule.shell + _LEEWAY) * self.local.resolution if rule.shell else 0.0
+        within, side = self.belief.grid.box, rule.novelty_block
+        return novel_beams(self.local, frame, self._width, self._novelty, within, short, side)
+
+    def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
+        """The components of the novel beams."""
+        scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
+        return fit_window([scan], self._rule.surface_fit(), all_origins(), self._rule.empty_fit())
+
+    def _count(self, frame: DepthFrame, chosen: Tensor, weight: int) -> Tensor:
+        """Adds the beams `chosen` (M,) to the counts of the components that explain them, with a weight each;
+        returns which of all beams (N,) are explained."""
+        rule, found = self._novelty, torch.zeros_like(frame.is_hit)
+        is_near = rule.distance_for == "all"
+        nearby = self._seen_from_near(frame.origin) if is_near else self._around(frame.ends[chosen])
+        if nearby is None or len(chosen) == 0:
+            return found
+        # A beam whose way alone makes it novel contributes free space, and so does one without return.
+        way = replace(frame, is_hit=torch.zeros_like(frame.is_hit))
+        frees = None if is_near else self._novel(way) | ~frame.is_hit
+        counted = nearby
+        for max_range in (False, True):
+            beams = chosen[frame.is_hit[chosen] != max_range]
+            counted, found[beams] = count_explained(
+                counted,
+                frame.ends[beams],
+                frame.origin,
+                rule.distance,
+                rule.explained,
+                max_range,
+                weight,
+                None if frees is None else frees[beams],
+            )
+        self._gain(nearby, counted.support - nearby.support)
+        return found
+
+    def _gain(self, nearby: Components, gain: Tensor) -> None:
+        """Adds points (K,) to the counts of components; counts that have grown enough become due."""
+        rows = (gain > 0).nonzero().squeeze(1)
+        columns = (nearby.ids[rows], gain[rows], nearby.support[rows])
+        for (robot, sequence), gained, support in zip(*(c.tolist() for c in columns), strict=True):
+            key = (robot, sequence)
+            total = self._gained.pop(key, 0.0) + gained
+            if total >= (self._rule.update_at - 1) * support:
+                self._due[key] = self._due.get(key, 0.0) + total
+            else:
+                self._gained[key] = total
+
+    def _around(self, points: Tensor) -> Components | None:
+        """Components, with all counts, of the batches that may explain points (M, 3); None if none may."""
+        near = self._by_explained.near(*points.aminmax(dim=0)) if len(points) else []
+        return summed(Components.concatenate(near)) if near else None
+
+    def _seen_from_near(self, origin: Tensor) -> Components | None:
+        """Components with all their counts, of batches seen from near a place (3,); None: there are none."""
+        middle = self._origin_cell(origin)
+        near = [
+            batch
+            for offset in itertools.product((-1, 0, 1), repeat=3)
+            for batch in self._by_origin.get(tuple(a + b for a, b in zip(middle, offset, strict=True)), [])
+        ]
+        if not near:
+            return None
+        known = [] if self._near is None else self._near[0]
+        if self._near is None or len(known) != len(near) or any(map(operator.is_not, known, near)):
+            self._near = near, summed(Components.concatenate(near))
+        return self._near[1]
+
+    def _origin_cell(self, origin: Tensor) -> tuple[int, ...]:
+        """The cell of `_by_origin` that contains a place (3,)."""
+        return tuple((origin / self._novelty.distance).floor().long().tolist())
+
+    # -- the mixture ------------------------------------------------------------------------------
+
+    def receive(self, received: Sequence[ReceivedMessage]) -> list[bytes]:
+        merged = [item.datagram for item in received if self.shared.receive(item.datagram, item.message)]
+        self._follow()
+        return merged
+
+    def components(self) -> Components:
+        """All components with all their counts, sorted by id."""
+        return self.shared.components()
+
+    def _follow(self) -> list[CellEvidence]:
+        """Enters the changes of the mixture since the last call; returns their evidence, in parts."""
+        changes = self.shared.changes()
+        if changes.rebuilt:
+            self._rebuild()
+            return []
+        batches = [*changes.added, changes.gained]
+        return [self._enter(batch) for batch in batches if len(batch)]
+
+    def _rebuild(self) -> None:
+        """Casts the whole mixture again, after components were moved or replaced."""
+        self.local.clear()
+        self.belief.clear()
+        self._forget()
+        everything = self.shared.components()
+        if len(everything):
+            self._enter(everything)
+
+    def _enter(self, batch: Components) -> CellEvidence:
+        """Enters a batch of components, or of counts added to some; returns its evidence."""
+        grid = self.belief.grid
+        there = batch.to(grid.device)
+        self._by_rays.add(there, *cone_bounds(there.cones(), _REACH))
+        self._by_explained.add(there, *box_around(there, explained_within(3, self._novelty.explained)))
+        for cell in {self._origin_cell(origin) for origin in batch.origins}:
+            self._by_origin.setdefault(cell, []).append(there)
+        evidence = self._memo(_key(batch), lambda: component_evidence(there, grid.box, self._rays))
+        self._add(evidence)
+        return evidence
+
+
+def _key(batch: Components) -> bytes:
+    """A hash of all values of a batch: corrected components keep their ids and support."""
+    digest = hashlib.blake2b(digest_size=16)
+    for value in batch.tensors().values():
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.digest()

@@ -9,12 +9,15 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere, feasible, passable_cells
+from gmmtorch.team.exploration.planning.collision_checking import (
+    LocalMap,
+    cells_in_sphere,
+    feasible,
+    passable_cells,
+)
 from gmmtorch.team.exploration.planning.planner_interface import LEAST
 from gmmtorch.team.exploration.planning.primitives import Primitives
-from gmmtorch.team.exploration.robot.mapper import LocalMap
-from gmmtorch.team.exploration.world.navigable import viewpoints
-from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.exploration.world.world import World, viewpoints
 
 _SPACING = 1.5  # metres between two starts
 _ROOMY = 1.0  # preferred distance (m) of a start from the nearest surface
