@@ -47,6 +47,10 @@ _REPLACED = {
     "link.ttl": "robots of a multicast group share one network.",
     "runtime.cache": "results that depend only on the world are always stored.",
     "stream.checkpoint_seconds": "use checkpoint_seconds.",
+    "dataset.damaged": "the intact part of a damaged recording is read, with a warning.",
+    "dataset.camera_info": "the topic nearest by name is read; dataset.intrinsics states another camera.",
+    "dataset.imu_topic": "of several IMUs, the one with most messages is read.",
+    "dataset.noise": _CONSTANT % "an argument of `gmmtorch.datasets.load`",
     "planner.beams": _CONSTANT % "`TeamOptions.n_beams`",
     "planner.prior": _CONSTANT % "`TeamOptions.planning_prior`, which a variant of a study may set",
 }

@@ -39,7 +39,6 @@ from .ros.message_decoder import BASE as BASE
 from .ros.message_decoder import NAME as NAME
 from .ros.message_decoder import MessageDecoder as MessageDecoder
 from .ros.point_times import Rate as Rate
-from .ros.rosbag import whole_or_intact as whole_or_intact
 from .ros.scan_conversion import ScanConversion as ScanConversion
 from .ros.sensor_messages import Reading as Reading
 from .ros.transform_tree import TransformTree as TransformTree

@@ -302,7 +302,7 @@ def test_the_number_of_components_can_be_automatic(run):
 def test_a_mesh_can_be_fitted(monkeypatch, tmp_path):
     mesh = tmp_path / "triangle.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    options = [*QUIET, "dataset=mesh", f"dataset.path={mesh}", "dataset.n_points=300", "dataset.noise=0.01"]
+    options = [*QUIET, "dataset=mesh", f"dataset.path={mesh}", "dataset.n_points=300"]
     done = succeeded(run_here(monkeypatch, "fit", tmp_path / "run", "mixture.n_components=4", *options))
     assert done.results()["rows"][0]["dataset"] == "triangle"
     assert done.results()["rows"][0]["n_points"] == 270

@@ -151,7 +151,6 @@ def test_damage_and_files_that_are_no_bags(check, tmp_path):
     path.write_bytes(path.read_bytes()[:-12_288])
     done = check(path, "dataset=rosbag")
     assert re.search(r"damage +\d+ messages in .* s are intact", done.stdout)
-    assert "dataset.damaged=refuse" not in done.stdout
     path.write_bytes(b"nothing" * 100)
     done = check(path, "dataset=rosbag")
     assert done.status == 1
