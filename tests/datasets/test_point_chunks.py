@@ -177,8 +177,8 @@ def chunk_table(data: bytes) -> int:
     ("names", "place", "content", "message"),
     [
         ("las laz", 103, b"\xff", "variable-length records"),
-        ("las laz", 96, b"\xff\xff\xff\x7f", "points from byte 2147483647"),
-        ("las laz", 105, b"\x01\x00", "1 bytes"),
+        ("las laz", 96, b"\xff\xff\xff\x7f", "byte 2147483647"),
+        ("las laz", 105, b"\x01\x00", "[Pp]oint"),
         ("las laz", 25, b"\x09", r"1\.9"),
         ("las laz", 131, struct.pack("<d", 0.0), "scales"),
         ("las laz", 139, struct.pack("<d", float("nan")), "scales"),
