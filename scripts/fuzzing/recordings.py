@@ -222,7 +222,7 @@ def logs() -> dict[str, Target]:
 
 def folders(folder: Path) -> dict[str, Target]:
     """Recordings in folders, of which one file is changed, and pictures."""
-    from gmmtorch.datasets.colour_images import read_image
+    from gmmtorch.datasets.depth_images import read_image
 
     rows, pose = b"1 0 0 1 0 1 0 2 0 0 1 3\n" * 2, b"1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n"
     cloud = (folder / "binary.pcd").read_bytes()
@@ -263,7 +263,11 @@ def folders(folder: Path) -> dict[str, Target]:
 
     Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(folder / "a.jpg")
     seeds = {**taken(folder, "a.jpg"), "a.png": png()}
-    return {**found, "colour images": Target(seeds, read_image, mended_png)}
+
+    def colours(path: Path) -> None:
+        read_image(path, str(path), ("JPEG", "PNG"), 1 << 25, "RGB")
+
+    return {**found, "colour images": Target(seeds, colours, mended_png)}
 
 
 def nuscenes() -> dict[str, Target]:
