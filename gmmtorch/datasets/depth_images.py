@@ -222,8 +222,8 @@ class DepthFrames(_DepthDataset):
             (_, _, cx), (_, _, cy), _ = self.intrinsics.tolist()
             raise DataError(
                 f"{self._files[index]} has {width}×{height} pixels, but camera-intrinsics.txt is for images "
-                f"of about {2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the image."
-                " Scale the intrinsics, or give the images in full size."
+                f"of about {2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the "
+                "image. Scale the intrinsics, or give the images in full size."
             )
         return depth
 

@@ -249,8 +249,8 @@ def _binary_nodes(file: io.BufferedIOBase, where: str) -> list[int]:
     left = length - file.tell()
     if n_edges * _EDGE_BYTES != left:
         raise DataError(
-            f"{where} announces {n_edges} edges after its {len(positions)} scans, but has {left} bytes; it is "
-            "damaged, so fetch it again."
+            f"{where} announces {n_edges} edges after its {len(positions)} scans, but has {left} bytes; it "
+            "is damaged, so fetch it again."
         )
     return positions
 
