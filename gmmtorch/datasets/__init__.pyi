@@ -18,7 +18,6 @@ from .point_files.point_chunks import open_points as open_points
 from .point_files.point_chunks import survey as survey
 from .ros.bag_poses import PoseSource as PoseSource
 from .ros.bag_poses import Record as Record
-from .ros.bag_poses import Standing as Standing
 from .ros.bag_poses import TfPoses as TfPoses
 from .ros.bag_reader import BagReader as BagReader
 from .ros.bag_reader import RawMessage as RawMessage

@@ -132,7 +132,7 @@ def packets(folder: Path) -> dict[str, Target]:
 
     def capture(path: Path) -> None:
         for topic in datasets.BagReader(path).topics:
-            if topic.type.endswith("Sweep"):
+            if topic.type.endswith("Datagram"):
                 options = {"calibration": str(folder / "os.json")} if topic.name.endswith("3392") else {}
                 read_all("rosbag", path, poses="standing", topic=topic.name, **options)
 

@@ -47,6 +47,17 @@ class _Place(NamedTuple):
     crc: int = 0
 
 
+class Connection(NamedTuple):
+    """A topic of a recording: the type of its messages, and their definition in the form MSG or IDL."""
+
+    id: int
+    topic: str
+    type: str
+    form: str = ""
+    definition: str = ""
+    n_messages: int = 0
+
+
 class BagFiles:
     """The messages of a bag, or those that a damaged one still has, in the order of recording.
 
@@ -55,7 +66,7 @@ class BagFiles:
         unpack: unpacks a chunk within limits. limit: bytes of a chunk or message, at most.
 
     Attributes:
-        connections: as those of a reader of rosbags.
+        connections: topics, once for each file and type.
         n_messages: that can be read.
         gaps: (first, last) time (ns) of each interval between intact messages whose messages are lost.
         first, last: times (ns) of the first and the last one.
@@ -69,7 +80,7 @@ class BagFiles:
     def __init__(self, files: Collection[Path], unpack: Unpack, limit: int) -> None:
         self._unpack, self._limit = unpack, limit
         self._sources: list[_Chunked | _Database] = []
-        self.connections: list[Any] = []
+        self.connections: list[Connection] = []
         self.gaps: list[tuple[int, int]] = []
         self.is_damaged = self.is_cut = False
         self.unread: list[str] = []
@@ -119,7 +130,7 @@ class BagFiles:
         counts, numbers = Counter(rows[:, 1].tolist()), dict[int, int]()
         for key, connection in source.connections().items():
             numbers[key] = len(self.connections)
-            self.connections.append(connection._replace(id=numbers[key], msgcount=counts[key]))
+            self.connections.append(connection._replace(id=numbers[key], n_messages=counts[key]))
         rows = rows[np.isin(rows[:, 1], list(numbers))]
         ids = np.array([numbers[key] for key in rows[:, 1].tolist()], np.int64)
         return np.column_stack([rows[:, 0], np.full_like(ids, len(self._sources) - 1), ids, rows[:, 2:]])
@@ -130,8 +141,8 @@ class BagFiles:
         return sum(end - begin for begin, end in self.gaps) / NANOSECONDS
 
     def messages(
-        self, connections: Collection[Any], start: int | None = None
-    ) -> Iterator[tuple[Any, int, bytes]]:
+        self, connections: Collection[Connection], start: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
         """(connection, time in ns, content) of messages of some connections, from a time on."""
         wanted = np.isin(self._rows[:, 2], [connection.id for connection in connections])
         if start is not None:
@@ -143,18 +154,9 @@ class BagFiles:
                 yield self.connections[connection], time, data
 
 
-def _connection(topic: str, kind: str, form: str, definition: str) -> Any:
-    from rosbags.interfaces import (
-        Connection,
-        ConnectionExtRosbag2,
-        MessageDefinition,
-        MessageDefinitionFormat,
-    )
-
+def _connection(topic: str, kind: str, form: str, definition: str) -> Connection:
     package, _, name = kind.rpartition("/")
-    kind = kind if "/msg/" in kind else f"{package}/msg/{name}"
-    text = MessageDefinition(MessageDefinitionFormat[form], definition)
-    return Connection(0, topic, kind, text, "", 0, ConnectionExtRosbag2("cdr", []), None)
+    return Connection(0, topic, kind if "/msg/" in kind else f"{package}/msg/{name}", form, definition)
 
 
 _ERRORS = (DataError, ValueError, KeyError, IndexError, struct.error, OverflowError, OSError, RuntimeError)
@@ -173,10 +175,10 @@ class _Chunked(ABC):
         with path.open("rb") as file:
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._kept: dict[int, bytes] = {}
-        self._connections: dict[int, Any] = {}
+        self._connections: dict[int, Connection] = {}
         self.fault = ""
 
-    def connections(self) -> dict[int, Any]:
+    def connections(self) -> dict[int, Connection]:
         """The connections by the numbers that messages have."""
         return self._connections
 
@@ -390,12 +392,12 @@ class _Mcap(_Chunked):
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._channels: dict[int, tuple[int, str]] = {}
 
-    def connections(self) -> dict[int, Any]:
+    def connections(self) -> dict[int, Connection]:
         found = {}
         for key, (schema, topic) in self._channels.items():
             if schema in self._schemas:
                 kind, encoding, text = self._schemas[schema]
-                found[key] = _connection(topic, kind, _MCAP_FORMS.get(encoding, "NONE"), text)
+                found[key] = _connection(topic, kind, _MCAP_FORMS.get(encoding, ""), text)
         return found
 
     def _first(self) -> int:
@@ -515,19 +517,18 @@ class _Database:
         self._n_calls += 1
         return self._n_calls > self._most_calls
 
-    def connections(self) -> dict[int, Any]:
+    def connections(self) -> dict[int, Connection]:
         """The topics by their numbers."""
         texts: dict[str, tuple[str, str]] = {}
         with suppress(self._error):  # older recordings have no definitions
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             texts = {
-                kind: (_MCAP_FORMS.get(form, "NONE"), text)
-                for kind, form, text in self._database.execute(query)
+                kind: (_MCAP_FORMS.get(form, ""), text) for kind, form, text in self._database.execute(query)
             }
         found = {}
         for key, topic, kind in self._database.execute("SELECT id, name, type FROM topics"):
             if isinstance(topic, str) and isinstance(kind, str):
-                found[key] = _connection(topic, kind, *texts.get(kind, ("NONE", "")))
+                found[key] = _connection(topic, kind, *texts.get(kind, ("", "")))
         return found
 
     def parts(self) -> Iterator[tuple[list[_Found], bool]]:

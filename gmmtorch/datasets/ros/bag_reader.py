@@ -14,7 +14,6 @@ import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets.packets.captures import SUFFIXES as CAPTURES
@@ -24,7 +23,6 @@ from gmmtorch.datasets.packets.sweeps import (
     SWEEP,
     CaptureMessages,
     Sweeps,
-    definition,
     is_lidar,
     packed,
     packet_of,
@@ -91,7 +89,7 @@ class BagReader:
         self._is_ros1 = self.path.suffix == ".bag"
         self._reader = CaptureMessages(self.path) if self.path.suffix in CAPTURES else self._opened()
         self._connections = self._reader.connections
-        sweep = parsed_definitions(definition(SWEEP_DEFINITION), SWEEP)
+        sweep = parsed_definitions("MSG", SWEEP_DEFINITION, SWEEP)
         self._decoder = MessageDecoder(
             {
                 **self._own_definitions(),
@@ -107,7 +105,7 @@ class BagReader:
         """All topics by name. A topic with messages of two types is listed twice."""
         counts: dict[tuple[str, str], int] = {}
         for c in self._connections:
-            counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
+            counts[c.topic, c.type] = counts.get((c.topic, c.type), 0) + c.n_messages
         return [Topic(*key, count) for key, count in sorted(counts.items())]
 
     @property
@@ -124,7 +122,7 @@ class BagReader:
 
         Messages with single packets of a lidar are put together to sweeps with the time of the first one.
         """
-        singles = {c.topic for c in self._connections if c.msgtype in SINGLE_PACKETS}
+        singles = {c.topic for c in self._connections if c.type in SINGLE_PACKETS}
         return (self._messages if singles.isdisjoint(topics) else self._sweeps)(topics, start)
 
     def _sweeps(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
@@ -134,7 +132,7 @@ class BagReader:
             if message.type not in SINGLE_PACKETS:
                 yield message
                 continue
-            key, data = (message.topic, message.type), packet_of(message.data, self._is_ros1)
+            key, data = (message.topic, message.type), packet_of(message.data, message.type, self._is_ros1)
             if is_lidar(data):
                 yield from self._sweep(*key, turns.setdefault(key, Sweeps()).add(message.time, data))
         for key, sweeps in turns.items():
@@ -152,7 +150,7 @@ class BagReader:
             if not self._is_ros1 and data.startswith(_ZSTD):  # CDR starts with a zero
                 with suppress(DataError):  # it is counted as one that cannot be decoded
                     data = _unpacked(data, "zstd", MAX_CHUNK_BYTES - 1)
-            yield RawMessage(connection.topic, connection.msgtype, time, data)
+            yield RawMessage(connection.topic, connection.type, time, data)
 
     def decode(self, message: RawMessage) -> dict[str, Any]:
         """The fields of a message. Raises `DataError`, which names the topic and the time of recording."""
@@ -206,17 +204,17 @@ class BagReader:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
         for c in self._connections:
-            stated = c.msgdef if c.msgdef.data or c.msgtype not in _PACKETS else _known(c.msgtype)
-            if c.msgtype not in found and (parsed := parsed_definitions(stated, c.msgtype)):
+            stated = ("MSG", _known(c.type)) if c.type in _PACKETS and not c.definition else c[3:5]
+            if c.type not in found and (parsed := parsed_definitions(*stated, c.type)):
                 found.update(parsed)
         return found
 
 
-def _known(message_type: str) -> SimpleNamespace:
+def _known(message_type: str) -> str:
     """The definition of a message with packets of a lidar."""
     package, (name, fields) = message_type.split("/")[0], _PACKETS[message_type]
     packet = f"{package}/{name}"
-    return definition(
+    return (
         f"std_msgs/Header header\n{packet}[] packets\n{'=' * 80}\nMSG: {packet}\n"
         f"builtin_interfaces/Time stamp\n{fields}\n"
     )
@@ -285,14 +283,14 @@ def standard_definitions(is_ros1: bool) -> dict[str, Any]:
     return dict(get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY).fielddefs)
 
 
-def parsed_definitions(definition: Any, message_type: str) -> dict[str, Any]:
+def parsed_definitions(form: str, text: str, message_type: str) -> dict[str, Any]:
     """The types of a definition in a bag; empty if it is missing or cannot be parsed."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     try:
-        if definition.format.name == "MSG":
-            return dict(get_types_from_msg(definition.data, message_type))
-        return dict(get_types_from_idl(definition.data)) if definition.format.name == "IDL" else {}
+        if form == "MSG":
+            return dict(get_types_from_msg(text, message_type))
+        return dict(get_types_from_idl(text)) if form == "IDL" else {}
     except Exception:  # the parser raises its own and many built-in errors
         return {}
 
