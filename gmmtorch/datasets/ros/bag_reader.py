@@ -39,6 +39,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"
 _PACKED = ".zstd"
 """Suffix of a file that is compressed as a whole."""
 _BLOCK_BYTES = 1 << 20
+_MOST_METADATA = 1 << 22  # characters
 _LEAST_MISSING = 0.05  # s at the end of a bag, below which it is whole
 _REPAIRS = {
     ".bag": "'rosbag reindex' repairs a recording that was interrupted",
@@ -247,14 +248,16 @@ def _files(path: Path) -> list[Path]:
 
 def _metadata(path: Path) -> str:
     """The text of metadata.yaml in a bag's folder; "" without one."""
-    file = path / "metadata.yaml"
-    return file.read_text("utf-8", errors="replace") if file.is_file() else ""
+    if not (path / "metadata.yaml").is_file():
+        return ""
+    with (path / "metadata.yaml").open(encoding="utf-8", errors="replace") as file:
+        return file.read(_MOST_METADATA)
 
 
 def _named(path: Path) -> list[str]:
     """The names of files in metadata.yaml."""
-    found = re.findall(r"[^\n/,'\"[]+\.(?:mcap|db3)(?:\.zstd)?\b", _metadata(path))
-    return sorted({name.split(": ")[-1].strip(" -") for name in found})
+    parts = {part.split(": ")[-1].strip(" -") for part in re.split(r"[\n/,'\"\[\]{}]", _metadata(path))}
+    return sorted(part for part in parts if part.removesuffix(_PACKED).endswith((".mcap", ".db3")))
 
 
 def _stated(path: Path) -> tuple[int, int]:
