@@ -297,17 +297,9 @@ _INTRINSICS = (525.0, 525.0, 319.5, 239.5)
 class TumRgbd(_DepthDataset):
     """Depth images as scans, in the order of their times, with poses interpolated at their times.
 
-    Images without a pose are left out and counted.
-
-    Args:
-        path: the folder of the sequence.
-        ranges, stride: see `Dataset`.
-        poses: another trajectory file with times; None: groundtruth.txt.
-        intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5.
-        depth_scale: metres per unit of the images.
-        max_gap: longest time (s) between two poses that are interpolated.
-        pixel_stride: every n-th pixel of every n-th row is used.
-        attributes: can be ["colour"]: of the image in rgb.txt that is nearest in time, within 20 ms.
+    Images without a pose are left out and counted. poses: another trajectory file with times; None:
+    groundtruth.txt. intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5. attributes: can be
+    ["colour"]: of the image in rgb.txt that is nearest in time, within 20 ms.
     """
 
     _poses: Tensor

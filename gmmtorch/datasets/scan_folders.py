@@ -207,15 +207,9 @@ class Kitti(_BinaryClouds):
     The world frame is that of the Velodyne at the origin of the poses: x forward, z up. The clouds of the
     benchmark are deskewed already.
 
-    Args:
-        path: the folder of the sequence. Poses are also found where the benchmark has them, in
-            `../../poses/NN.txt`.
-        ranges, stride: see `Dataset`.
-        poses: another trajectory: KITTI rows of the camera as in poses.txt, or TUM rows of the Velodyne,
-            which need times.txt.
-        max_gap: longest time (s) between two poses of a TUM trajectory that are interpolated.
-        attributes: channels that are read: "intensity", the reflectance; "class", the label of SemanticKITTI
-            (the lower 16 bits; 0, unlabeled, is unknown).
+    Poses are also found where the benchmark has them, in `../../poses/NN.txt`. Others are KITTI rows of the
+    camera as in poses.txt, or TUM rows of the Velodyne, which need times.txt. Channels are "intensity", the
+    reflectance, and "class", the label of SemanticKITTI (the lower 16 bits; 0, unlabeled, is unknown).
     """
 
     def __init__(
@@ -336,11 +330,8 @@ class NuScenes(_BinaryClouds):
     The world frame is that of the map of the city. Sweeps are compensated for motion already. Those whose
     file is missing are left out and counted: if only the key frames were fetched, they are read.
 
-    Args:
-        path: the folder of the data set with `samples/`, `sweeps/` and `v1.0-mini/`, or the folder of tables.
-        ranges, stride: see `Dataset`.
-        scene: its name, as in "scene-0061"; None: the only one.
-        attributes: channels that are read: "intensity".
+    The folder has `samples/`, `sweeps/` and the tables in `v1.0-mini/`, or is that of the tables. scene: its
+    name, as in "scene-0061"; None: the only one. The channel is "intensity".
     """
 
     _width = 5

@@ -83,14 +83,9 @@ class TfPoses(PoseSource):
 
 
 class BodyPoses(PoseSource):
-    """Poses of a body from a trajectory, and the sensor's pose on it.
+    """Poses of a body from a trajectory (world ← body), and those of sensors on it (body ← sensor) by frame.
 
-    Args:
-        trajectory: world ← body.
-        mounts: body ← sensor for each frame of a sensor.
-        max_gap: longest time in seconds between two poses to interpolate.
-        name: of the trajectory, for messages.
-        can_deskew: False if it has poses at the stamps of scans only.
+    max_gap: see `Trajectory.at`. name: for messages. can_deskew: False with poses at stamps of scans only.
     """
 
     def __init__(

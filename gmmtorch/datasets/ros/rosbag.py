@@ -480,11 +480,8 @@ def sensor_turns(
     """Rotations (M, 3, 3) of a sensor since the scan before, before ← now; the first is the identity.
 
     Where the rotation of the IMU or of its mounting is unknown, they are NaN, and a warning states how many.
-
-    Args:
-        gyroscope: of the IMU. tree: TF, with the mounting of both.
-        frames: of the sensor at each scan (M). stamps: of the scans (M,), ns, in order.
-        max_gap: longest time (s) between two transforms that are interpolated, if the mounting moves.
+    frames: of the sensor at each scan (M). stamps: of the scans (M,), ns, in order. max_gap: longest time (s)
+    between two transforms that are interpolated, if the mounting moves.
 
     Raises `InvalidArgumentError` if TF does not connect the frames, or if no rotation is known.
     """
