@@ -144,6 +144,11 @@ class Dataset(Sequence[Scan]):
         """Times (s), float64, of all scans of the source; None if the source has no usable times."""
         return self._times
 
+    def _known_time(self, index: int) -> float | None:
+        """Time (s) of scan `index` of the source; None if the source has no usable times."""
+        times = self._known_times()
+        return None if times is None else float(times[index])
+
     def pose(self, index: int) -> Tensor | None:
         """Pose (D+1, D+1) of the sensor for scan `index`, world ← sensor, float64, metres.
 
@@ -213,8 +218,8 @@ class Dataset(Sequence[Scan]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         position = self._position(index)
-        scan, times = self._read(position), self._known_times()
-        return scan if times is None else replace(scan, time=float(times[position]))
+        scan, time = self._read(position), self._known_time(position)
+        return scan if time is None else replace(scan, time=time)
 
     def _position(self, index: int) -> int:
         """Position in the source of scan `index` of the data set; a negative index counts from the end."""
