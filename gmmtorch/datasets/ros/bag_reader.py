@@ -243,7 +243,8 @@ def _files(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     found = [f for f in sorted(path.iterdir()) if f.name.removesuffix(_PACKED).endswith(_SUFFIXES)]
-    return [f for f in found if f.name in _named(path)] or found
+    named = _named(path)
+    return [f for f in found if f.name in named] or found
 
 
 def _metadata(path: Path) -> str:
