@@ -13,7 +13,6 @@ import struct
 import zlib
 from abc import ABC, abstractmethod
 from array import array
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -127,13 +126,16 @@ class BagFiles:
                 found.extend(message)
         self.is_cut |= is_after_loss
         rows = np.array(found, np.int64).reshape(-1, 4)
-        counts, numbers = Counter(rows[:, 1].tolist()), dict[int, int]()
+        keys, place, counts = np.unique(rows[:, 1], return_inverse=True, return_counts=True)
+        n_messages = dict(zip(keys.tolist(), counts.tolist(), strict=True))
+        numbers = dict[int, int]()
         for key, connection in source.connections().items():
             numbers[key] = len(self.connections)
-            self.connections.append(connection._replace(id=numbers[key], n_messages=counts[key]))
-        rows = rows[np.isin(rows[:, 1], list(numbers))]
-        ids = np.array([numbers[key] for key in rows[:, 1].tolist()], np.int64)
-        return np.column_stack([rows[:, 0], np.full_like(ids, len(self._sources) - 1), ids, rows[:, 2:]])
+            one = connection._replace(id=numbers[key], n_messages=n_messages.get(key, 0))
+            self.connections.append(one)
+        ids = np.array([numbers.get(key, -1) for key in keys.tolist()], np.int64)[place]
+        of = np.full_like(ids, len(self._sources) - 1)
+        return np.column_stack([rows[:, 0], of, ids, rows[:, 2:]])[ids >= 0]
 
     @property
     def missing_seconds(self) -> float:
