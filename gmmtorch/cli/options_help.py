@@ -70,6 +70,10 @@ _REPLACED = {
     % "`TeamOptions.codec`, which a variant of a study may set; team=gmm_thesis has its own",
     "rounds": "there are always three.",
     "planner.rest": _CONSTANT % "`TeamOptions.rest`",
+    "dataset.damaged": "the intact part of a damaged recording is read, with a warning.",
+    "dataset.camera_info": "the topic nearest by name is read; dataset.intrinsics states another camera.",
+    "dataset.imu_topic": "of several IMUs, the one with most messages is read.",
+    "dataset.noise": _CONSTANT % "an argument of `gmmtorch.datasets.load`",
     "planner.beams": _CONSTANT % "`TeamOptions.n_beams`",
     "planner.prior": _CONSTANT % "`TeamOptions.planning_prior`, which a variant of a study may set",
 }

@@ -18,7 +18,6 @@ from .point_files.point_chunks import open_points as open_points
 from .point_files.point_chunks import survey as survey
 from .ros.bag_poses import PoseSource as PoseSource
 from .ros.bag_poses import Record as Record
-from .ros.bag_poses import Standing as Standing
 from .ros.bag_poses import TfPoses as TfPoses
 from .ros.bag_reader import BagReader as BagReader
 from .ros.bag_reader import RawMessage as RawMessage
@@ -39,7 +38,6 @@ from .ros.message_decoder import BASE as BASE
 from .ros.message_decoder import NAME as NAME
 from .ros.message_decoder import MessageDecoder as MessageDecoder
 from .ros.point_times import Rate as Rate
-from .ros.rosbag import whole_or_intact as whole_or_intact
 from .ros.scan_conversion import ScanConversion as ScanConversion
 from .ros.sensor_messages import Reading as Reading
 from .ros.transform_tree import TransformTree as TransformTree

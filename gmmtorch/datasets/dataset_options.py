@@ -132,11 +132,6 @@ class RosbagOptions(TumOptions):
     )
     clock: str = option("header", "header: stamps of the messages; received: times of recording")
     deskew: bool = option(True, "each point with a time gets the pose of its own time")
-    camera_info: str | None = option(
-        None, "topic of the camera parameters of depth images; null: the nearest by name"
-    )
-    imu_topic: str | None = option(None, "topic of the IMU of motion=imu; null: the only one")
-    damaged: str = option("read", "read: the intact part of a damaged bag; refuse: a damaged bag is an error")
     calibration: str | None = option(
         None,
         "file of the lidar whose packets are read: metadata (.json) of an Ouster, corrections (.csv) of a "
@@ -149,7 +144,6 @@ class MeshOptions(FileOptions):
     """Points of a mesh."""
 
     n_points: int = option(100_000, "number of points sampled from the surface of the mesh")
-    noise: float = option(0.0, "standard deviation (m) of the points along each axis")
     seed: int = option(0, "seed of the simulation, its points or its noise")
 
 

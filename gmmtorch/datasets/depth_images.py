@@ -12,16 +12,16 @@ bits, in 1/5000 m; 0 is invalid. `rgb.txt`: rows `time file` of images that are 
 from __future__ import annotations
 
 import io
+from abc import abstractmethod
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from gmmtorch.datasets.base import NO_POSE, Dataset, Ranges, check_poses, natural_key, require_path
-from gmmtorch.datasets.colour_images import ColourCamera
 from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.trajectory import (
     NANOSECONDS,
@@ -32,7 +32,7 @@ from gmmtorch.datasets.trajectory import (
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhole_matrix
 from gmmtorch.pose import Pose
-from gmmtorch.scan import COLOUR, Scan
+from gmmtorch.scan import COLOUR, Scan, linear_colours
 
 _INVALID = (0, 65535)
 MAX_PIXELS = 1 << 23
@@ -48,35 +48,128 @@ _UPRIGHT = {
 }
 """The rotation that turns an axis into z."""
 _COLOUR_INTRINSICS, _COLOUR_POSE = "color-intrinsics.txt", "color-pose.txt"
-_CHANNELS = "depth images have the channel colour only"
+
+
+# -- colours -----------------------------------------------------------------------------------------
+
+
+_MAX_COLOUR_PIXELS = 1 << 25
+_BLOCK = 4  # pixels: a side of the blocks of the colour image in which points hide each other
+_BEHIND = 0.05  # share of the depth by which a hidden point is behind a nearer one in its block
+
+
+class ColourCamera(NamedTuple):
+    """The camera of colour images. intrinsics (3, 3) in pixels; pose (4, 4), colour camera ← depth camera,
+    metres; None: the images are registered to the depth images, pixel by pixel."""
+
+    intrinsics: Tensor
+    pose: Tensor | None = None
+
+    def colours(self, points: Tensor, path: Path, depth_shape: tuple[int, int]) -> Tensor:
+        """Linear RGB (N, 3) of points (N, 3) in the depth camera's frame; NaN for those that the colour
+        camera does not see: outside its image, or behind others.
+
+        path: of the image. depth_shape: rows and columns of the depth image.
+        """
+        image = torch.from_numpy(read_image(path, str(path), ("JPEG", "PNG"), _MAX_COLOUR_PIXELS, "RGB"))
+        shape = height, width = int(image.shape[0]), int(image.shape[1])
+        if shape != depth_shape and self.pose is None:
+            raise DataError(
+                f"{path} has {width}×{height} pixels, but the depth image {depth_shape[1]}×{depth_shape[0]}; "
+                "write color-intrinsics.txt and color-pose.txt, or register the image to the depth."
+            )
+        if not is_centered(self.intrinsics, shape):
+            raise DataError(
+                f"{path} has {width}×{height} pixels, but its intrinsics are those of images of another size."
+            )
+        seen = points.double()
+        if self.pose is not None:
+            seen = seen @ self.pose[:3, :3].T + self.pose[:3, 3]
+        pixel = seen @ self.intrinsics.T
+        depth = pixel[:, 2]
+        u, v = (pixel[:, :2] / depth.clamp_min(1e-9)[:, None]).round().long().unbind(1)
+        inside = (depth > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        u, v = u.clamp(0, width - 1), v.clamp(0, height - 1)
+        if self.pose is not None:
+            block = (v // _BLOCK) * -(-width // _BLOCK) + u // _BLOCK
+            block = torch.where(inside, block, 0)
+            nearest = depth.new_full((-(-height // _BLOCK) * -(-width // _BLOCK),), torch.inf)
+            nearest.scatter_reduce_(0, block[inside], depth[inside], "amin")
+            inside &= depth <= (1 + _BEHIND) * nearest[block]
+        found = linear_colours(torch.arange(256) / 255)[image[v, u].long()]
+        return torch.where(inside[:, None], found, torch.nan)
+
+
+# -- folders of images -------------------------------------------------------------------------------
 
 
 class _DepthDataset(Dataset):
-    """Depth images, whose points have colours if `attributes` names them."""
+    """Depth images in files, whose points have colours if `attributes` names them.
 
-    attributes: tuple[str, ...]
+    pixel_stride: every n-th pixel of every n-th row is used. depth_scale: metres per unit of the images.
+    intrinsics: the pinhole matrix (3, 3) in pixels.
+    """
 
-    def _colours(
-        self, points: Tensor, path: Path | None, camera: ColourCamera, depth: Tensor, index: int
-    ) -> dict[str, Tensor]:
-        """The channels of the points of a depth image, from the colour image in a file, if there is one."""
-        if not self.attributes:
-            return {}
-        if path is None:
-            self._without(self.attributes, index)
-            return {}
-        return {COLOUR: camera.colours(points, path, (depth.shape[0], depth.shape[1]))}
+    intrinsics: Tensor
+    _camera: ColourCamera
+    _files: list[Path]
+
+    def __init__(
+        self,
+        name: str,
+        ranges: Ranges,
+        stride: int,
+        pixel_stride: int,
+        depth_scale: float,
+        attributes: Iterable[str],
+    ) -> None:
+        super().__init__(name, ranges, stride)
+        self.attributes = check_channels(attributes, [COLOUR], "depth images have the channel colour only")
+        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        self.depth_scale = check_number("depth_scale", depth_scale, above=True)
+
+    @abstractmethod
+    def _colour_file(self, index: int) -> Path | None:
+        """The colour image of a depth image; None without one."""
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        depth, pose = self._depth(index), self._known_pose(index)
+        assert pose is not None
+        points, channels = back_project(depth, self.intrinsics, self.pixel_stride), {}
+        if self.attributes:
+            path = self._colour_file(index)
+            if path is None:
+                self._without(self.attributes, index)
+            else:
+                channels[COLOUR] = self._camera.colours(points, path, (depth.shape[0], depth.shape[1]))
+        return self.ranges.posed(points, pose, channels)
+
+    def image(self, index: int) -> tuple[Tensor, Tensor]:
+        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
+
+        The rotation, which is rounded in files, is made orthonormal.
+        """
+        position = self._position(index)
+        pose = self._known_pose(position)
+        assert pose is not None
+        return self._depth(position), Pose.from_matrix(pose).orthonormal().matrix
+
+    def _depth(self, index: int) -> Tensor:
+        """Depth (H, W) in metres, float64; 0 for invalid pixels."""
+        path = self._files[index]
+        return metric(read_png(path, str(path)), self.depth_scale)
 
 
 class DepthFrames(_DepthDataset):
     """Depth images as scans, in the natural order of their names (frame-2 before frame-10).
 
     Pixels at a distance of `max_range` metres or beyond have no return. Depths 0 and 65535 are invalid
-    and dropped. `pixel_stride` keeps every n-th pixel of every n-th row. `depth_scale` is the number of
-    metres per unit of the images. `intrinsics` is the pinhole matrix (3, 3) in pixels. `image` returns the
-    full depth image of a scan. An image whose middle is far from the principal point is refused: it has
-    another size than the intrinsics. `up` is the axis of the world frame of the pose files that points up;
-    the frame is turned so that it becomes z. `attributes` can be ["colour"].
+    and dropped. An image whose middle is far from the principal point is refused: it has another size than
+    the intrinsics. `up` is the axis of the world frame of the pose files that points up; the frame is turned
+    so that it becomes z. `attributes` can be ["colour"].
     """
 
     def __init__(
@@ -89,19 +182,15 @@ class DepthFrames(_DepthDataset):
         up: str = "z",
         attributes: Iterable[str] = (),
     ) -> None:
-        self.attributes = check_channels(attributes, [COLOUR], _CHANNELS)
         path = require_path(
             path,
             "folder",
             "frame-*.depth.png, frame-*.pose.txt and camera-intrinsics.txt",
             "Microsoft's 7-Scenes data set is published in this layout.",
         )
-        super().__init__(path.name, ranges, stride)
-        check_number("depth_scale", depth_scale, above=True)
-        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
+        super().__init__(path.name, ranges, stride, pixel_stride, depth_scale, attributes)
         check_choice("up", up, _UPRIGHT)
         self._upright = torch.tensor(_UPRIGHT[up], dtype=torch.float64)
-        self.depth_scale = float(depth_scale)
         self._files = sorted(path.glob("frame-*.depth.png"), key=natural_key)
         if not self._files:
             raise DataError(f"{path} holds no frame-*.depth.png.")
@@ -121,37 +210,20 @@ class DepthFrames(_DepthDataset):
         except InvalidArgumentError as error:
             raise DataError(f"{file}: {error}") from error
 
-    def _count(self) -> int:
-        return len(self._files)
-
-    def _read(self, index: int) -> Scan:
-        depth = self._depth(index)
-        points = back_project(depth, self.intrinsics, self.pixel_stride)
+    def _colour_file(self, index: int) -> Path | None:
         stem = self._files[index].name.removesuffix(".depth.png")
         files = [self._files[index].with_name(f"{stem}.color.{ending}") for ending in ("jpg", "png")]
-        channels = self._colours(points, next(filter(Path.is_file, files), None), self._camera, depth, index)
-        return self.ranges.posed(points, self._known_pose(index), channels)
-
-    def image(self, index: int) -> tuple[Tensor, Tensor]:
-        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
-
-        The rotation, which is rounded in the file, is made orthonormal.
-        """
-        position = self._position(index)
-        pose = Pose.from_matrix(self._known_pose(position)).orthonormal()
-        return self._depth(position), pose.matrix
+        return next(filter(Path.is_file, files), None)
 
     def _depth(self, index: int) -> Tensor:
-        """Depth (H, W) in metres, float64; 0 for invalid pixels."""
-        path = self._files[index]
-        depth = metric(read_png(path, str(path)), self.depth_scale)
+        depth = super()._depth(index)
         height, width = depth.shape
         if not is_centered(self.intrinsics, (height, width)):
             (_, _, cx), (_, _, cy), _ = self.intrinsics.tolist()
             raise DataError(
-                f"{path} has {width}×{height} pixels, but camera-intrinsics.txt is for images of about "
-                f"{2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the image. Scale "
-                "the intrinsics, or give the images in full size."
+                f"{self._files[index]} has {width}×{height} pixels, but camera-intrinsics.txt is for images "
+                f"of about {2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the "
+                "image. Scale the intrinsics, or give the images in full size."
             )
         return depth
 
@@ -164,25 +236,35 @@ class DepthFrames(_DepthDataset):
 
 def read_png(source: Path | IO[bytes], where: str) -> np.ndarray:
     """The pixels (H, W) of a PNG image with one channel of 16 bits. `where` begins the `DataError`s."""
+    raw = read_image(source, where, ("PNG",), MAX_PIXELS)
+    if raw.ndim != 2 or raw.dtype not in (np.uint16, np.int32):
+        raise DataError(f"{where} is {raw.dtype} of shape {raw.shape}; expected one 16-bit channel.")
+    return raw
+
+
+def read_image(
+    path: Path | IO[bytes], where: str, formats: tuple[str, ...], most_pixels: int, mode: str = ""
+) -> np.ndarray:
+    """The pixels (H, W, …) of an image, in one of Pillow's modes, such as "RGB", or in its own.
+
+    Raises `DataError`, which begins with `where`, if it is damaged, of another format, or too large.
+    """
     from PIL import Image
 
     try:
         # From memory, because Pillow asks a file for as many bytes as a damaged chunk announces.
-        content = io.BytesIO(source.read_bytes()) if isinstance(source, Path) else source
-        with Image.open(content, formats=("PNG",)) as image:
-            if image.width * image.height > MAX_PIXELS:
+        source = io.BytesIO(path.read_bytes()) if isinstance(path, Path) else path
+        with Image.open(source, formats=formats) as image:
+            if image.width * image.height > most_pixels:
                 raise DataError(
-                    f"{where} announces {image.width} × {image.height} pixels; at most "
-                    f"{MAX_PIXELS:,} are read."
+                    f"{where} announces {image.width} × {image.height} pixels; at most {most_pixels:,} are "
+                    "read."
                 )
-            raw = np.asarray(image)
+            return np.array(image.convert(mode) if mode else image)
     except DataError:
         raise
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise DataError(f"{where} is not a complete PNG image: {error}") from error
-    if raw.ndim != 2 or raw.dtype not in (np.uint16, np.int32):
-        raise DataError(f"{where} is {raw.dtype} of shape {raw.shape}; expected one 16-bit channel.")
-    return raw
+        raise DataError(f"{where} is not a complete {' or '.join(formats)} image: {error}") from error
 
 
 def metric(raw: np.ndarray, scale: float) -> Tensor:
@@ -215,18 +297,9 @@ _INTRINSICS = (525.0, 525.0, 319.5, 239.5)
 class TumRgbd(_DepthDataset):
     """Depth images as scans, in the order of their times, with poses interpolated at their times.
 
-    Images without a pose are left out and counted. `intrinsics` is the pinhole matrix (3, 3) in pixels;
-    `image` returns the full depth image of a scan.
-
-    Args:
-        path: the folder of the sequence.
-        ranges, stride: see `Dataset`.
-        poses: another trajectory file with times; None: groundtruth.txt.
-        intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5.
-        depth_scale: metres per unit of the images.
-        max_gap: longest time (s) between two poses that are interpolated.
-        pixel_stride: every n-th pixel of every n-th row is used.
-        attributes: can be ["colour"]: of the image in rgb.txt that is nearest in time, within 20 ms.
+    Images without a pose are left out and counted. poses: another trajectory file with times; None:
+    groundtruth.txt. intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5. attributes: can be
+    ["colour"]: of the image in rgb.txt that is nearest in time, within 20 ms.
     """
 
     _poses: Tensor
@@ -243,18 +316,15 @@ class TumRgbd(_DepthDataset):
         pixel_stride: int = 1,
         attributes: Iterable[str] = (),
     ) -> None:
-        self.attributes = check_channels(attributes, [COLOUR], _CHANNELS)
         path = require_path(
             path,
             "folder",
             "depth.txt, groundtruth.txt and depth/*.png",
             "The TUM RGB-D benchmark publishes sequences in this layout.",
         )
-        super().__init__(path.resolve().name, ranges, stride)
-        self.pixel_stride = check_whole("pixel_stride", pixel_stride, 1)
-        check_number("depth_scale", depth_scale, above=True)
-        self._scale = depth_scale
+        super().__init__(path.resolve().name, ranges, stride, pixel_stride, depth_scale, attributes)
         self.intrinsics = pinhole_matrix(_INTRINSICS if intrinsics is None else intrinsics)
+        self._camera = ColourCamera(self.intrinsics)
         times, files = _listed(path / "depth.txt")
         trajectory = read_trajectory(poses or path / "groundtruth.txt")
         if not trajectory.has_times:
@@ -274,24 +344,12 @@ class TumRgbd(_DepthDataset):
         self._times = torch.from_numpy(times[found.known] / NANOSECONDS)
         self._images = _nearest(path / "rgb.txt", times[found.known]) if self.attributes else []
 
-    def _count(self) -> int:
-        return len(self._files)
-
-    def _read(self, index: int) -> Scan:
-        depth = self._depth(index)
-        points = back_project(depth, self.intrinsics, self.pixel_stride)
-        image = self._images[index] if self._images else None
-        channels = self._colours(points, image, ColourCamera(self.intrinsics), depth, index)
-        return self.ranges.posed(points, self._poses[index], channels)
-
-    def image(self, index: int) -> tuple[Tensor, Tensor]:
-        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
-        position = self._position(index)
-        return self._depth(position), self._poses[position]
+    def _colour_file(self, index: int) -> Path | None:
+        return self._images[index]
 
     def _depth(self, index: int) -> Tensor:
         path = self._files[index]
-        return torch.from_numpy(read_png(path, str(path)) * self._scale)
+        return torch.from_numpy(read_png(path, str(path)) * self.depth_scale)
 
 
 _MOST_APART = 20_000_000  # ns between a depth image and its colour image

@@ -42,13 +42,28 @@ from gmmtorch.pose import Pose
 from gmmtorch.scan import Scan
 
 
-class ScanFolder(Dataset):
+class _CloudFiles(Dataset):
+    """Scans in point files, whose points have channels if `attributes` names them, see `read_channels`."""
+
+    attributes: tuple[str, ...]
+    _files: list[Path]
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _channels(self, index: int) -> dict[str, Tensor]:
+        """The channels of the points of a scan that it has; a scan that lacks some is counted."""
+        channels = read_channels(self._files[index], self.attributes) if self.attributes else {}
+        self._without(set(self.attributes) - channels.keys(), index)
+        return channels
+
+
+class ScanFolder(_CloudFiles):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
     invalid and dropped; scans with infinite points, or NaN in a PLY file, are counted. With `standing`,
-    poses.txt is not read, and every scan is in the frame of the sensor. `attributes`: names of the channels
-    that are read, see `read_channels`.
+    poses.txt is not read, and every scan is in the frame of the sensor.
     """
 
     _poses: torch.Tensor
@@ -83,23 +98,14 @@ class ScanFolder(Dataset):
                 "write one pose for each scan, in the order of the file names."
             )
 
-    def _count(self) -> int:
-        return len(self._files)
-
     def _read(self, index: int) -> Scan:
         points = read_cloud(self._files[index])
-        self._count_invalid(points, index)
-        channels = read_channels(self._files[index], self.attributes) if self.attributes else {}
-        self._without(set(self.attributes) - channels.keys(), index)
-        return self.ranges.posed(points, self._poses[index], channels)
-
-    def _count_invalid(self, points: torch.Tensor, index: int) -> None:
-        """Counts a scan with points that are not finite. NaN in a PCD file is a beam without return."""
         usual = torch.isfinite(points)
         if self._files[index].suffix == ".pcd":
-            usual |= points.isnan()
+            usual |= points.isnan()  # a beam without return
         if not bool(usual.all()):
             self._skip("points dropped: their coordinates are not finite", index)
+        return self.ranges.posed(points, self._poses[index], self._channels(index))
 
 
 def _read_poses(path: Path) -> torch.Tensor:
@@ -115,12 +121,11 @@ def _read_poses(path: Path) -> torch.Tensor:
     return kitti_poses(path, rows).matrix
 
 
-class PcdViewpoint(Dataset):
+class PcdViewpoint(_CloudFiles):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` from the viewpoint have no return. NaN, infinite points and points at the
-    sensor origin are invalid and dropped. The orientation in VIEWPOINT is not used. `attributes`: names of
-    the channels that are read, see `read_channels`.
+    sensor origin are invalid and dropped. The orientation in VIEWPOINT is not used.
     """
 
     def __init__(
@@ -138,18 +143,13 @@ class PcdViewpoint(Dataset):
         if not self._files:
             raise DataError(f"{path} contains no .pcd file.")
 
-    def _count(self) -> int:
-        return len(self._files)
-
     def _known_pose(self, index: int) -> torch.Tensor:
         """The position in VIEWPOINT with the rotation of the world frame."""
         return Pose.from_yaw(0.0, _viewpoint(self._files[index])).matrix
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        channels = read_channels(path, self.attributes) if self.attributes else {}
-        self._without(set(self.attributes) - channels.keys(), index)
-        return self.ranges.scan(read_cloud(path), _viewpoint(path), None, channels)
+        return self.ranges.scan(read_cloud(path), _viewpoint(path), None, self._channels(index))
 
 
 def _viewpoint(path: Path) -> torch.Tensor:
@@ -172,24 +172,45 @@ def _viewpoint(path: Path) -> torch.Tensor:
 _CALIBRATION = "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
 
 
-class Kitti(Dataset):
+class _BinaryClouds(Dataset):
+    """Scans in files of float32: x, y, z and intensity, and further numbers up to `_width`."""
+
+    attributes: tuple[str, ...]
+    _files: list[Path]
+    _poses: Tensor
+    _width = 4
+
+    def _count(self) -> int:
+        return len(self._files)
+
+    def _read(self, index: int) -> Scan:
+        """The scan of the points that are finite and not at the sensor."""
+        path = self._files[index]
+        if path.stat().st_size % (4 * self._width):
+            raise DataError(
+                f"{path} is not a whole number of points of {4 * self._width} bytes; it is truncated."
+            )
+        table = np.fromfile(path, "<f4").reshape(-1, self._width)
+        points = torch.from_numpy(table[:, :3].astype(np.float64))
+        valid = points.isfinite().all(1) & (points != 0).any(1)
+        channels = {name: values[valid] for name, values in self._channels(path, table).items()}
+        return self.ranges.posed(points[valid], self._poses[index], channels)
+
+    def _channels(self, path: Path, table: np.ndarray) -> dict[str, Tensor]:
+        intensity = torch.from_numpy(np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan))
+        return {INTENSITY: intensity} if INTENSITY in self.attributes else {}
+
+
+class Kitti(_BinaryClouds):
     """Scans of one sequence in the natural order of their file names.
 
     The world frame is that of the Velodyne at the origin of the poses: x forward, z up. The clouds of the
     benchmark are deskewed already.
 
-    Args:
-        path: the folder of the sequence. Poses are also found where the benchmark has them, in
-            `../../poses/NN.txt`.
-        ranges, stride: see `Dataset`.
-        poses: another trajectory: KITTI rows of the camera as in poses.txt, or TUM rows of the Velodyne,
-            which need times.txt.
-        max_gap: longest time (s) between two poses of a TUM trajectory that are interpolated.
-        attributes: channels that are read: "intensity", the reflectance; "class", the label of SemanticKITTI
-            (the lower 16 bits; 0, unlabeled, is unknown).
+    Poses are also found where the benchmark has them, in `../../poses/NN.txt`. Others are KITTI rows of the
+    camera as in poses.txt, or TUM rows of the Velodyne, which need times.txt. Channels are "intensity", the
+    reflectance, and "class", the label of SemanticKITTI (the lower 16 bits; 0, unlabeled, is unknown).
     """
-
-    _poses: Tensor
 
     def __init__(
         self,
@@ -235,34 +256,11 @@ class Kitti(Dataset):
         self._poses = found[known].matrix
         self._times = None if times is None else torch.from_numpy(times[: len(files)][known])
 
-    def _count(self) -> int:
-        return len(self._files)
-
-    def _read(self, index: int) -> Scan:
-        path = self._files[index]
-        table = _binary_points(path, 4)
-        channels = _intensity(table) if INTENSITY in self.attributes else {}
+    def _channels(self, path: Path, table: np.ndarray) -> dict[str, Tensor]:
+        channels = super()._channels(path, table)
         if CLASS in self.attributes:
             channels[CLASS] = torch.from_numpy(_kitti_labels(path, len(table)))
-        return _valid_scan(self.ranges, table, self._poses[index], channels)
-
-
-def _binary_points(path: Path, n_numbers: int) -> np.ndarray:
-    """The points (N, n_numbers) of a file of float32."""
-    if path.stat().st_size % (4 * n_numbers):
-        raise DataError(f"{path} is not a whole number of points of {4 * n_numbers} bytes; it is truncated.")
-    return np.fromfile(path, "<f4").reshape(-1, n_numbers)
-
-
-def _intensity(table: np.ndarray) -> dict[str, Tensor]:
-    return {INTENSITY: torch.from_numpy(np.where(np.isfinite(table[:, 3]), table[:, 3], np.nan))}
-
-
-def _valid_scan(ranges: Ranges, table: np.ndarray, pose: Tensor, channels: dict[str, Tensor]) -> Scan:
-    """The scan of the points (N, …) that are finite and not at the sensor, with channels (N,)."""
-    points = torch.from_numpy(table[:, :3].astype(np.float64))
-    valid = points.isfinite().all(1) & (points != 0).any(1)
-    return ranges.posed(points[valid], pose, {name: values[valid] for name, values in channels.items()})
+        return channels
 
 
 def _kitti_labels(scan: Path, n_points: int) -> np.ndarray:
@@ -326,20 +324,17 @@ _TOKEN = re.compile(rb'"token"\s*:\s*"([^"]{1,80})"')
 _LIDAR_FILE, _TOP = b".pcd.bin", "LIDAR_TOP"
 
 
-class NuScenes(Dataset):
+class NuScenes(_BinaryClouds):
     """The sweeps of the lidar in one scene of nuScenes, at 20 a second, in the order of their times.
 
     The world frame is that of the map of the city. Sweeps are compensated for motion already. Those whose
     file is missing are left out and counted: if only the key frames were fetched, they are read.
 
-    Args:
-        path: the folder of the data set with `samples/`, `sweeps/` and `v1.0-mini/`, or the folder of tables.
-        ranges, stride: see `Dataset`.
-        scene: its name, as in "scene-0061"; None: the only one.
-        attributes: channels that are read: "intensity".
+    The folder has `samples/`, `sweeps/` and the tables in `v1.0-mini/`, or is that of the tables. scene: its
+    name, as in "scene-0061"; None: the only one. The channel is "intensity".
     """
 
-    _poses: Tensor
+    _width = 5
 
     def __init__(
         self,
@@ -370,14 +365,6 @@ class NuScenes(Dataset):
         mount = _transforms(tables / "calibrated_sensor.json", mounts)
         self._poses = (ego @ mount).matrix
         self._times = torch.tensor([row["timestamp"] / 1e6 for row in sweeps], dtype=torch.float64)
-
-    def _count(self) -> int:
-        return len(self._files)
-
-    def _read(self, index: int) -> Scan:
-        table = _binary_points(self._files[index], 5)
-        channels = _intensity(table) if INTENSITY in self.attributes else {}
-        return _valid_scan(self.ranges, table, self._poses[index], channels)
 
 
 def _tables(path: Path) -> Path:

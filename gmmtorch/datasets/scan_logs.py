@@ -133,7 +133,6 @@ _LINE_BYTES = 1 << 12
 _COUNT = struct.Struct("<I")
 _POINT = np.dtype([("length", "<i4"), ("values", "<f8", 3)])
 _POSE = struct.Struct("<i3di4d")
-_NODE_BYTES = 2 * _COUNT.size + _POSE.size  # of a node without points
 _EDGE_BYTES = 2 * _COUNT.size + _POSE.size + 8
 _NORM_ERROR = 1e-2
 
@@ -158,10 +157,7 @@ class OctomapLog(Dataset):
         with self._open() as file:
             self._is_binary = _is_binary(file)
             file.seek(0)
-            if self._is_binary:
-                self._nodes = _binary_node_positions(file, str(self._path))
-            else:
-                self._nodes = _node_positions(file)
+            self._nodes = (_binary_nodes if self._is_binary else _node_positions)(file, str(self._path))
         if not self._nodes:
             missing = "scan" if self._is_binary else "NODE line, so it is not an OctoMap scan log"
             raise DataError(f"{self._path} has no {missing}.")
@@ -180,7 +176,12 @@ class OctomapLog(Dataset):
         where = f"{self._path}, scan {index}"
         if self._is_binary:
             with self._open() as file:
-                return torch.from_numpy(_read_points(file, self._nodes[index], where))
+                file.seek(self._nodes[index])
+                n_points = _count(file, where)
+                points = np.frombuffer(file.read(n_points * _POINT.itemsize), _POINT)
+            if not (points["length"] == 3).all():
+                raise DataError(f"{where} has points that are not three numbers; the file is damaged.")
+            return torch.from_numpy(points["values"].astype(np.float64))
         stop = self._nodes[index + 1] if index + 1 < len(self._nodes) else None
         with self._open() as file:
             file.seek(self._nodes[index])
@@ -192,9 +193,9 @@ class OctomapLog(Dataset):
     def _known_pose(self, index: int) -> Tensor:
         where = f"{self._path}, scan {index}"
         with self._open() as file:
-            if self._is_binary:
-                return _read_pose(file, self._nodes[index], where)
             file.seek(self._nodes[index])
+            if self._is_binary:
+                return _read_pose(file, where)
             head = file.readline(_LINE_BYTES).decode("ascii", errors="replace")
         return _node_pose(head, where)
 
@@ -213,7 +214,7 @@ def rotation(roll: float, pitch: float, yaw: float) -> Tensor:
     return z @ y @ x
 
 
-def _node_positions(file: io.BufferedIOBase) -> list[int]:
+def _node_positions(file: io.BufferedIOBase, where: str) -> list[int]:
     """Byte positions of the NODE lines in the file."""
     positions, position = [], 0
     for line in file:
@@ -232,41 +233,55 @@ def _is_binary(file: io.BufferedIOBase) -> bool:
     return b"\0" in file.read(2 * _COUNT.size)
 
 
-def _binary_node_positions(file: io.BufferedIOBase, where: str) -> list[int]:
+def _binary_nodes(file: io.BufferedIOBase, where: str) -> list[int]:
     """Byte positions of the nodes in the file, whose sizes are all checked against its length.
 
     Raises `DataError`, which begins with `where`, if the file is cut off or of another format.
     """
     length = file.seek(0, io.SEEK_END)
-    positions, position = [], _COUNT.size
-    for node in range(_count(file, 0, where)):
-        if position + _NODE_BYTES > length:
-            raise DataError(f"{where} ends within scan {node}; it is cut off, so fetch it again.")
-        positions.append(position)
-        _pose_numbers(file, position, length, f"{where}, scan {node}")
-        position += _NODE_BYTES + _count(file, position, where) * _POINT.itemsize
-    n_edges = _count(file, position, where)
-    if position + _COUNT.size + n_edges * _EDGE_BYTES != length:
+    file.seek(0)
+    positions = []
+    for node in range(_count(file, where)):
+        positions.append(file.tell())
+        _pose_numbers(file, f"{where}, scan {node}")
+        _count(file, where)  # its id
+    n_edges = _count(file, where)
+    left = length - file.tell()
+    if n_edges * _EDGE_BYTES != left:
         raise DataError(
-            f"{where} announces {n_edges} edges after its {len(positions)} scans, but has "
-            f"{length - position - _COUNT.size} bytes there; it is damaged, so fetch it again."
+            f"{where} announces {n_edges} edges after its {len(positions)} scans, but has {left} bytes; it "
+            "is damaged, so fetch it again."
         )
     return positions
 
 
-def _read_points(file: io.BufferedIOBase, position: int, where: str) -> np.ndarray:
-    """Points (N, 3), sensor frame (m), of the node at a byte position."""
-    n_bytes = _count(file, position, where) * _POINT.itemsize
-    points = np.frombuffer(file.read(n_bytes), _POINT)
-    if not (points["length"] == 3).all():
-        raise DataError(f"{where} has points that are not three numbers; the file is damaged.")
-    return points["values"].astype(np.float64)
+def _count(file: io.BufferedIOBase, where: str) -> int:
+    """The number at the position of the file."""
+    data = file.read(_COUNT.size)
+    if len(data) < _COUNT.size:
+        raise DataError(f"{where} ends where a number is expected; it is cut off, so fetch it again.")
+    return int(_COUNT.unpack(data)[0])
 
 
-def _read_pose(file: io.BufferedIOBase, position: int, where: str) -> Tensor:
-    """Pose (4, 4), world ← sensor, of the node at a byte position."""
-    length = file.seek(0, io.SEEK_END)
-    x, y, z, *quaternion = _pose_numbers(file, position, length, where)
+def _pose_numbers(file: io.BufferedIOBase, where: str) -> tuple[float, ...]:
+    """x, y, z, w, x, y, z of the pose of the node at the position of the file, which is then after it."""
+    n_points = _count(file, where)
+    file.seek(n_points * _POINT.itemsize, io.SEEK_CUR)
+    data = file.read(_POSE.size)
+    if len(data) < _POSE.size:
+        raise DataError(
+            f"{where} announces {n_points} points, which the file is too short for; it is cut off, or not a "
+            "scan graph of OctoMap."
+        )
+    three, x, y, z, four, *quaternion = _POSE.unpack(data)
+    if (three, four) != (3, 4):
+        raise DataError(f"{where} has no pose where one is expected; this is not a scan graph of OctoMap.")
+    return x, y, z, *quaternion
+
+
+def _read_pose(file: io.BufferedIOBase, where: str) -> Tensor:
+    """Pose (4, 4), world ← sensor, of the node at the position of the file."""
+    x, y, z, *quaternion = _pose_numbers(file, where)
     norm = math.hypot(*quaternion)
     if not abs(norm - 1) < _NORM_ERROR:
         raise DataError(f"{where}: the quaternion {quaternion} has length {norm:.3g} instead of 1.")
@@ -274,26 +289,3 @@ def _read_pose(file: io.BufferedIOBase, position: int, where: str) -> Tensor:
         raise DataError(f"{where} is not a rigid pose: its position {[x, y, z]} is not finite.")
     w, *axis = quaternion
     return Pose.from_quaternion([x, y, z], [*axis, w]).matrix
-
-
-def _count(file: io.BufferedIOBase, position: int, where: str) -> int:
-    file.seek(position)
-    data = file.read(_COUNT.size)
-    if len(data) < _COUNT.size:
-        raise DataError(f"{where} ends where a count is expected; it is cut off, so fetch it again.")
-    return int(_COUNT.unpack(data)[0])
-
-
-def _pose_numbers(file: io.BufferedIOBase, position: int, length: int, where: str) -> list[float]:
-    """x, y, z, w, x, y, z of the pose of the node at a byte position in a file of `length` bytes."""
-    n_points = _count(file, position, where)
-    if position + _NODE_BYTES + n_points * _POINT.itemsize > length:
-        raise DataError(
-            f"{where} announces {n_points} points, which the file is too short for; it is cut off, or not a "
-            "scan graph of OctoMap."
-        )
-    file.seek(position + _COUNT.size + n_points * _POINT.itemsize)
-    three, x, y, z, four, *quaternion = _POSE.unpack(file.read(_POSE.size))
-    if (three, four) != (3, 4):
-        raise DataError(f"{where} has no pose where one is expected; this is not a scan graph of OctoMap.")
-    return [x, y, z, *quaternion]

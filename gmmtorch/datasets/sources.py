@@ -5,37 +5,30 @@ from __future__ import annotations
 import importlib
 import inspect
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from gmmtorch.datasets.base import Dataset, Ranges
 from gmmtorch.datasets.dataset_options import OPTIONS
 from gmmtorch.errors import InvalidArgumentError
 
-
-class _Source(NamedTuple):
-    """The module and class of a data set."""
-
-    module: str
-    reader: str
-    needs_path: bool = True
-
-
-_SOURCES = {
-    "carmen": _Source("scan_logs", "CarmenLog"),
-    "scan_folder": _Source("scan_folders", "ScanFolder"),
-    "pcd_viewpoint": _Source("scan_folders", "PcdViewpoint"),
-    "depth_frames": _Source("depth_images", "DepthFrames"),
-    "e57": _Source("point_files.e57_files", "E57Scans"),
-    "octomap_log": _Source("scan_logs", "OctomapLog"),
-    "rosbag": _Source("ros.rosbag", "open_rosbag"),
-    "kitti": _Source("scan_folders", "Kitti"),
-    "nuscenes": _Source("scan_folders", "NuScenes"),
-    "tum": _Source("depth_images", "TumRgbd"),
-    "mesh": _Source("synthetic", "MeshSamples"),
-    "mesh_scans": _Source("synthetic", "MeshScans"),
-    "synthetic_building": _Source("synthetic", "SyntheticBuilding", needs_path=False),
-    "synthetic_building_2d": _Source("synthetic", "SyntheticBuilding2D", needs_path=False),
+_READERS = {
+    "carmen": "scan_logs.CarmenLog",
+    "scan_folder": "scan_folders.ScanFolder",
+    "pcd_viewpoint": "scan_folders.PcdViewpoint",
+    "depth_frames": "depth_images.DepthFrames",
+    "e57": "point_files.e57_files.E57Scans",
+    "octomap_log": "scan_logs.OctomapLog",
+    "rosbag": "ros.rosbag.open_rosbag",
+    "kitti": "scan_folders.Kitti",
+    "nuscenes": "scan_folders.NuScenes",
+    "tum": "depth_images.TumRgbd",
+    "mesh": "synthetic.MeshSamples",
+    "mesh_scans": "synthetic.MeshScans",
+    "synthetic_building": "synthetic.SyntheticBuilding",
+    "synthetic_building_2d": "synthetic.SyntheticBuilding2D",
 }
+_SIMULATED = ("synthetic_building", "synthetic_building_2d")
+"""Data sets without a path."""
 
 
 def load(
@@ -71,10 +64,11 @@ def load(
     Raises `InvalidArgumentError` for an unknown name or option or an invalid value, `MissingDataError` for a
     path that does not exist, and `DataError`, now or when a scan is read, for unreadable data.
     """
-    if name not in _SOURCES:
-        raise InvalidArgumentError(f"dataset={name!r} is not known; choose one of {', '.join(_SOURCES)}.")
-    source = _SOURCES[name]
-    reader = getattr(importlib.import_module(f"gmmtorch.datasets.{source.module}"), source.reader)
+    if name not in _READERS:
+        raise InvalidArgumentError(f"dataset={name!r} is not known; choose one of {', '.join(_READERS)}.")
+    module, _, function = _READERS[name].rpartition(".")
+    reader = getattr(importlib.import_module(f"gmmtorch.datasets.{module}"), function)
+    needs_path = name not in _SIMULATED
     given = {"max_range": max_range, "no_return_range": no_return_range}
     ranges = Ranges(**{n: getattr(OPTIONS[name], n) if v is None else v for n, v in given.items()})
     known = set(inspect.signature(reader).parameters) - {"path", "ranges", "stride"}
@@ -88,15 +82,15 @@ def load(
             raise InvalidArgumentError(
                 f"{option}={value!r} is not an option of dataset={name}, which {takes}."
             )
-    if source.needs_path and poses is not None and "poses" not in known:
+    if needs_path and poses is not None and "poses" not in known:
         from gmmtorch.datasets.trajectory import with_trajectory
 
         return with_trajectory(reader(path, ranges, 1, **options), poses, stride)
     for option, value in (("path", path), ("poses", poses)):
-        if value is not None and not source.needs_path:
+        if value is not None and not needs_path:
             raise InvalidArgumentError(
                 f"{option}={value} is given, but dataset={name} is simulated; drop it, or choose one "
-                f"of {', '.join(n for n, s in _SOURCES.items() if s.needs_path)}."
+                f"of {', '.join(n for n in _READERS if n not in _SIMULATED)}."
             )
-    dataset: Dataset = reader(*[path] * source.needs_path, ranges, stride, **options)
+    dataset: Dataset = reader(*[path] * needs_path, ranges, stride, **options)
     return dataset

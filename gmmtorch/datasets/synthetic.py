@@ -103,18 +103,10 @@ class SyntheticBuilding(_Simulated):
 class MeshScans(_Simulated):
     """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64 pixels), range 30 m, noise 1 cm.
 
-    The sensor moves through the largest connected part of the mesh, 1.2 m above the floor (see
-    `MeshWorld.tour`); a camera faces forward. Beams without a surface within the sensor's range, or within
-    `max_range` if that is shorter, have no return. Scan i depends only on the mesh, the seed, the number of
+    The sensor moves through the largest connected part of the mesh (PLY, OBJ or STL; metres, z up), 1.2 m
+    above the floor (see `MeshWorld.tour`); a camera faces forward. Scans are about 2 m apart, and parts of
+    the mesh beyond the last one are not observed. Scan i depends only on the mesh, the seed, the number of
     scans and i.
-
-    Args:
-        path: PLY, OBJ or STL; metres, z up.
-        ranges: how readings are interpreted.
-        stride: every n-th scan is read.
-        n_scans: number of scans, about 2 m apart. Parts of the mesh beyond the last one are not observed.
-        sensor: "lidar" or "depth_camera".
-        seed: of the sensor's noise.
     """
 
     def __init__(
@@ -136,16 +128,8 @@ class MeshScans(_Simulated):
 class MeshSamples(Dataset):
     """One scan of `n_points` points, uniform on the surface, with isotropic Gaussian noise.
 
-    The sensor origin is the centre of the bounding box. Points at or beyond `max_range` from it have no
-    return.
-
-    Args:
-        path: PLY, OBJ or STL; metres.
-        ranges: how readings are interpreted.
-        stride: see `Dataset`.
-        n_points: number of points.
-        noise: standard deviation (m) along each axis.
-        seed: of the random numbers.
+    The mesh is a PLY, OBJ or STL file in metres, and the sensor origin the centre of its bounding box. Points
+    at or beyond `max_range` from it have no return. noise: standard deviation (m) along each axis.
     """
 
     def __init__(

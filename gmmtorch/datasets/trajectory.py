@@ -101,8 +101,7 @@ def read_trajectory(path: str | Path, n_scans: int | None = None) -> Trajectory:
     """A trajectory file: TUM rows (time x y z qx qy qz qw), or KITTI rows (12 numbers, no time).
 
     TUM rows out of order are sorted, with a warning. n_scans: wanted number of poses without times, one for
-    each scan; None: any. Raises `MissingDataError`
-    and `DataError`, which names the row.
+    each scan; None: any. Raises `MissingDataError` and `DataError`, which names the row.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -177,11 +176,8 @@ _MAX_GAP = 2.0
 def with_trajectory(source: Dataset, path: str | Path, stride: int) -> Dataset:
     """Every `stride`-th scan of a data set (stride 1) with poses, moved to those of a trajectory file.
 
-    Args:
-        source: a data set that states its poses.
-        path: KITTI rows, one for each scan; or TUM rows, which are interpolated at the times of the scans
-            over at most two seconds. Both state the pose of the sensor, world ← sensor.
-        stride: every n-th scan is read.
+    The file has KITTI rows, one for each scan, or TUM rows, which are interpolated at the times of the scans
+    over at most two seconds. Both state the pose of the sensor, world ← sensor.
 
     Raises `InvalidArgumentError` if the data set has no poses, or no times for TUM rows, and `DataError`.
     """

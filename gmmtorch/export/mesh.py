@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
-import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.export.point_cloud import RGB, colour_bytes, ply_bytes
+from gmmtorch.export.point_cloud import RGB, colour_bytes, glb_bytes, ply_bytes
 from gmmtorch.files import write_bytes
 from gmmtorch.linalg import ragged_index
 from gmmtorch.mapping import Components
@@ -259,8 +257,6 @@ def _compact(points: Tensor, normals: Tensor, faces: Tensor) -> TriangleMesh:
     return TriangleMesh(points[used], normals[used], place.view(-1, 3))
 
 
-_GLTF_FLOAT, _GLTF_UINT = 5126, 5125  # component types
-_ARRAY, _ELEMENTS = 34962, 34963  # buffer targets
 _UPRIGHT = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]  # quaternion that turns z up, ours, to y up, glTF's
 
 
@@ -286,13 +282,9 @@ def write_mesh(path: str | Path, mesh: TriangleMesh, colours: Tensor | None = No
 
 
 def _ply(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: Tensor | None) -> bytes:
-    columns = [vertices.astype("<f8"), normals.astype("<f4")]
-    columns += [] if linear is None else [colour_bytes(linear)]
-    names = ("x", "y", "z", "nx", "ny", "nz", *RGB)[: 3 * len(columns)]
-    rows = np.empty(len(vertices), [(name, columns[i // 3].dtype) for i, name in enumerate(names)])
-    for i, name in enumerate(names):
-        rows[name] = columns[i // 3][:, i % 3]
-    return ply_bytes(rows, faces=faces)
+    columns = [*vertices.astype("<f8").T, *normals.astype("<f4").T]
+    columns += [] if linear is None else [*colour_bytes(linear).T]
+    return ply_bytes(dict(zip(("x", "y", "z", "nx", "ny", "nz", *RGB), columns, strict=False)), faces=faces)
 
 
 def _obj(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: Tensor | None) -> bytes:
@@ -306,44 +298,18 @@ def _obj(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: T
 
 def _glb(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, linear: Tensor | None) -> bytes:
     middle = (vertices.min(0) + vertices.max(0)) / 2
-    local = (vertices - middle).astype("<f4")
-    parts = [local.tobytes(), normals.astype("<f4").tobytes(), faces.astype("<u4").tobytes()]
-    parts += [] if linear is None else [linear.numpy().astype("<f4").tobytes()]
-    begins = np.cumsum([0, *map(len, parts)]).tolist()
     x, y, z = middle.tolist()
-    kinds = (
-        (_GLTF_FLOAT, len(local), "VEC3"),
-        (_GLTF_FLOAT, len(normals), "VEC3"),
-        (_GLTF_UINT, faces.size, "SCALAR"),
-        (_GLTF_FLOAT, len(local), "VEC3"),
-    )[: len(parts)]
-    attributes = {"POSITION": 0, "NORMAL": 1} | ({} if linear is None else {"COLOR_0": 3})
-    accessors: list[dict[str, object]] = [
-        {"bufferView": view, "componentType": kind, "count": count, "type": shape}
-        for view, (kind, count, shape) in enumerate(kinds)
-    ]
-    accessors[0] |= {"min": local.min(0).tolist(), "max": local.max(0).tolist()}
+    attributes = {"POSITION": vertices - middle, "NORMAL": normals}
+    attributes |= {} if linear is None else {"COLOR_0": linear.numpy()}
     shade = [0.75, 0.75, 0.78, 1.0] if linear is None else [1.0] * 4
     surface = {"baseColorFactor": shade, "metallicFactor": 0.0, "roughnessFactor": 0.9}
-    content = {
-        "asset": {"version": "2.0", "generator": "gmmtorch"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _UPRIGHT, "translation": [x, z, -y]}],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 2, "material": 0}]}],
-        "materials": [{"doubleSided": True, "pbrMetallicRoughness": surface}],
-        "buffers": [{"byteLength": begins[-1]}],
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": begin, "byteLength": len(part), "target": target}
-            for begin, part, target in zip(begins, parts, (_ARRAY, _ARRAY, _ELEMENTS, _ARRAY), strict=False)
-        ],
-        "accessors": accessors,
-    }
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    data = b"".join(parts)  # every part is a multiple of four bytes long
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    return glb_bytes(
+        attributes,
+        faces,
+        primitive={"material": 0},
+        node={"rotation": _UPRIGHT, "translation": [x, z, -y]},
+        materials=[{"doubleSided": True, "pbrMetallicRoughness": surface}],
+    )
 
 
 _WRITERS: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray, Tensor | None], bytes]] = {

@@ -167,24 +167,19 @@ def of_grid(grid: OccupancyGrid, occupied: float) -> Levels:
     highest = ends.scatter_reduce(0, column, heights, "amax", include_self=False)
     floor = _peak(lowest, torch.ones_like(lowest), grid.resolution)
     assert floor is not None  # there are cells
-    high = (highest > floor.height + _LEAST_GAP).double()
+    high = (highest > floor[0] + _LEAST_GAP).double()
     return _levels(floor, _peak(highest, high, grid.resolution), float(heights.max()))
 
 
-class _Peak(NamedTuple):
-    """The height (m) of the layers with most area, and their area."""
-
-    height: float
-    area: float
-
-
-def _levels(floor: _Peak, ceiling: _Peak | None, top: float) -> Levels:
-    is_strong = ceiling is not None and ceiling.area >= _WEAK * floor.area
-    return Levels(floor.height, ceiling.height if ceiling is not None and is_strong else None, top)
+def _levels(floor: tuple[float, float], ceiling: tuple[float, float] | None, top: float) -> Levels:
+    """The levels of two peaks, see `_peak`; a ceiling with too little area is none."""
+    is_strong = ceiling is not None and ceiling[1] >= _WEAK * floor[1]
+    return Levels(floor[0], ceiling[0] if ceiling is not None and is_strong else None, top)
 
 
-def _peak(heights: Tensor, area: Tensor, resolution: float) -> _Peak | None:
-    """The three neighbouring layers of cells with most area (N,) at heights (N,); None without area."""
+def _peak(heights: Tensor, area: Tensor, resolution: float) -> tuple[float, float] | None:
+    """The height (m) and the area of the three neighbouring layers of cells with most area (N,) at heights
+    (N,); None without area."""
     if not bool((area > 0).any()):
         return None
     layers = ((heights - heights.min()) / resolution).long()
@@ -192,7 +187,7 @@ def _peak(heights: Tensor, area: Tensor, resolution: float) -> _Peak | None:
     smooth = histogram[:-2] + histogram[1:-1] + histogram[2:]
     strongest = int(smooth.argmax())
     weight = area * ((layers - strongest).abs() <= 1)
-    return _Peak(float((heights * weight).sum() / weight.sum()), float(smooth[strongest]))
+    return float((heights * weight).sum() / weight.sum()), float(smooth[strongest])
 
 
 class DistanceField(NamedTuple):

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +28,7 @@ from gmmtorch.optional_packages import load_pyoctomap
 from gmmtorch.scan import display_colours
 
 RGB = ("red", "green", "blue")
+_GLTF_TYPES, _GLTF_TARGETS = {"f": 5126, "u": 5125}, {"f": 34962, "u": 34963}
 _MIN_STEPS = 16  # least number of float32 values per cell side; with fewer, centres would be too inexact
 
 
@@ -90,15 +96,10 @@ def write_ply(path: str | Path, cells: CellCloud, colours: Tensor | None = None)
     `colours`: linear RGB (M, 3) from 0 to 1, written as sRGB: red, green, blue (uchar).
     """
     comment = f"centres of cells of {cells.resolution!r} m; intensity is the probability of occupancy"
-    rows = _records(cells, "<f8")
+    columns = _columns(cells, "<f8")
     if colours is not None:
-        coloured = np.empty(len(rows), [*rows.dtype.descr, *((name, "u1") for name in RGB)])
-        for name in rows.dtype.names or ():
-            coloured[name] = rows[name]
-        for name, column in zip(RGB, colour_bytes(colours).T, strict=True):
-            coloured[name] = column
-        rows = coloured
-    return write_bytes(path, ply_bytes(rows, comment))
+        columns |= dict(zip(RGB, colour_bytes(colours).T, strict=True))
+    return write_bytes(path, ply_bytes(columns, comment))
 
 
 def colour_bytes(colours: Tensor) -> np.ndarray:
@@ -107,19 +108,81 @@ def colour_bytes(colours: Tensor) -> np.ndarray:
     return shades.round().numpy().astype(np.uint8)
 
 
-def ply_bytes(vertices: np.ndarray, comment: str = "", faces: np.ndarray | None = None) -> bytes:
-    """Binary PLY of vertices, a structured array (V,) of floating numbers and bytes, and triangles (F, 3)."""
+def ply_bytes(
+    vertices: Mapping[str, np.ndarray], comment: str = "", faces: np.ndarray | None = None
+) -> bytes:
+    """Binary PLY of vertices, columns (V,) of floating numbers and bytes, and triangles (F, 3)."""
     names = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0"] + [f"comment {comment}"] * bool(comment)
-    header += [f"element vertex {len(vertices)}"]
-    header += [f"property {names[vertices.dtype[name].str]} {name}" for name in vertices.dtype.names or ()]
-    content = vertices.tobytes()
+    header += [f"element vertex {len(next(iter(vertices.values())))}"]
+    header += [f"property {names[column.dtype.str]} {name}" for name, column in vertices.items()]
+    content = _rows(vertices)
     if faces is not None:
-        triangles = np.empty(len(faces), [("n", "u1"), ("corners", "<i4", 3)])
-        triangles["n"], triangles["corners"] = 3, faces
+        content += _rows({"n": np.full(len(faces), 3, np.uint8), "corners": faces.astype("<i4")})
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-        content += triangles.tobytes()
     return "\n".join([*header, "end_header\n"]).encode("ascii") + content
+
+
+def _rows(columns: Mapping[str, np.ndarray]) -> bytes:
+    """Columns (N, …), row by row."""
+    length = len(next(iter(columns.values())))
+    rows = np.empty(length, [(name, values.dtype, values.shape[1:]) for name, values in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    return rows.tobytes()
+
+
+def glb_bytes(
+    vertices: Mapping[str, np.ndarray],
+    faces: np.ndarray | None = None,
+    primitive: Mapping[str, Any] = MappingProxyType({}),
+    node: Mapping[str, Any] = MappingProxyType({}),
+    **more: Any,
+) -> bytes:
+    """Binary glTF 2.0 of one primitive: attributes (V, n) of vertices by name, as float32, and triangles
+    (F, 3). primitive, node and `more` are further entries of these objects, and of the file.
+    """
+    tables = [values.astype("<f4") for values in vertices.values()]
+    tables += [] if faces is None else [faces.astype("<u4").reshape(-1, 1)]
+    shapes = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+    data = [table.tobytes() for table in tables]  # each a multiple of four bytes long
+    begins = np.cumsum([0, *map(len, data)]).tolist()
+    accessors: list[dict[str, Any]] = [
+        {
+            "bufferView": view,
+            "componentType": _GLTF_TYPES[table.dtype.kind],
+            "count": len(table),
+            "type": shapes[table.shape[1]],
+        }
+        for view, table in enumerate(tables)
+    ]
+    accessors[0] |= {"min": tables[0].min(0).tolist(), "max": tables[0].max(0).tolist()}
+    indices = {} if faces is None else {"indices": len(vertices)}
+    attributes = {name: number for number, name in enumerate(vertices)}
+    content = {
+        "asset": {"version": "2.0", "generator": "gmmtorch"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **node}],
+        "meshes": [{"primitives": [{"attributes": attributes, **indices, **primitive}]}],
+        "buffers": [{"byteLength": begins[-1]}],
+        "bufferViews": [
+            {
+                "buffer": 0,
+                "byteOffset": begin,
+                "byteLength": len(part),
+                "target": _GLTF_TARGETS[table.dtype.kind],
+            }
+            for begin, part, table in zip(begins, data, tables, strict=False)
+        ],
+        "accessors": accessors,
+        **more,
+    }
+    text = json.dumps(content, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", begins[-1], b"BIN\0") + b"".join(data)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def write_pcd(path: str | Path, cells: CellCloud) -> Path:
@@ -150,16 +213,13 @@ def write_pcd(path: str | Path, cells: CellCloud) -> Path:
             "DATA binary\n",
         ]
     )
-    return write_bytes(path, header.encode("ascii") + _records(cells, "<f4").tobytes())
+    return write_bytes(path, header.encode("ascii") + _rows(_columns(cells, "<f4")))
 
 
-def _records(cells: CellCloud, kind: str) -> np.ndarray:
-    """A structured array of cells: x, y, z of this type, and intensity."""
-    rows = np.empty(len(cells), [*((axis, kind) for axis in "xyz"), ("intensity", "<f4")])
-    for axis, values in zip("xyz", cells.positions().T, strict=True):
-        rows[axis] = values
-    rows["intensity"] = cells.probability.detach().cpu().numpy()
-    return rows
+def _columns(cells: CellCloud, kind: str) -> dict[str, np.ndarray]:
+    """Columns (M,) of cells: x, y, z of this type, and intensity."""
+    columns = dict(zip("xyz", cells.positions().astype(kind).T, strict=True))
+    return columns | {"intensity": cells.probability.detach().cpu().numpy().astype("<f4")}
 
 
 _REACH = 1 << 15  # cells on either side of the origin, because OctoMap's keys have 16 bits

@@ -9,7 +9,6 @@ SPZ and glTF y is up, as these formats ask for.
 from __future__ import annotations
 
 import gzip
-import json
 import math
 import struct
 import warnings
@@ -24,7 +23,7 @@ from torch import Tensor
 
 from gmmtorch.datasets import ply_fields, ply_rows
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, check_number
-from gmmtorch.export.point_cloud import ply_bytes
+from gmmtorch.export.point_cloud import glb_bytes, ply_bytes
 from gmmtorch.files import write_bytes
 from gmmtorch.mapping import Attributes, Components, GaussianMap, Numbers
 from gmmtorch.pose import Pose
@@ -116,9 +115,7 @@ def _ply(splats: Splats) -> bytes:
         **{f"scale_{i}": column for i, column in enumerate(splats.deviations.clamp_min(1e-9).log().T)},
         **{f"rot_{i}": column for i, column in enumerate(splats.quaternions()[:, [3, 0, 1, 2]].T)},
     }
-    table = np.empty(len(splats.means), [(name, "<f4") for name in columns])
-    for name, column in columns.items():
-        table[name] = column.numpy()
+    table = {name: column.numpy().astype("<f4") for name, column in columns.items()}
     return ply_bytes(table, "3D Gaussian splats of a gmmtorch map, z up")
 
 
@@ -163,44 +160,20 @@ def _glb(splats: Splats) -> bytes:
         raise InvalidArgumentError("No surface: glTF has no empty tables; export the map as .ply or .spz.")
     splats = splats.turned(_Y_UP)
     name = "KHR_gaussian_splatting"
-    opaque = torch.cat([linear_colours(splats.colours), splats.opacity[:, None]], 1)
     columns = {
-        "POSITION": (splats.means, "VEC3"),
-        "COLOR_0": (opaque, "VEC4"),
-        f"{name}:ROTATION": (splats.quaternions(), "VEC4"),
-        f"{name}:SCALE": (splats.deviations, "VEC3"),
-        f"{name}:OPACITY": (splats.opacity[:, None], "SCALAR"),
-        f"{name}:SH_DEGREE_0_COEF_0": (_harmonics(splats), "VEC3"),
-    }
-    data, views, accessors = b"", [], []
-    for values, kind in columns.values():
-        part = values.float().numpy().astype("<f4").tobytes()
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(part)})
-        accessors.append(
-            {"bufferView": len(views) - 1, "componentType": 5126, "count": len(values), "type": kind}
-        )
-        data += part
-    accessors[0] |= {
-        "min": splats.means.float().amin(0).tolist(),
-        "max": splats.means.float().amax(0).tolist(),
+        "POSITION": splats.means,
+        "COLOR_0": torch.cat([linear_colours(splats.colours), splats.opacity[:, None]], 1),
+        f"{name}:ROTATION": splats.quaternions(),
+        f"{name}:SCALE": splats.deviations,
+        f"{name}:OPACITY": splats.opacity[:, None],
+        f"{name}:SH_DEGREE_0_COEF_0": _harmonics(splats),
     }
     extension = {name: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
-    primitive = {"mode": 0, "attributes": {key: i for i, key in enumerate(columns)}, "extensions": extension}
-    text = {
-        "asset": {"version": "2.0", "generator": "gmmtorch"},
-        "extensionsUsed": [name],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "buffers": [{"byteLength": len(data)}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    chunk = json.dumps(text, separators=(",", ":")).encode()
-    chunk += b" " * (-len(chunk) % 4)
-    body = struct.pack("<I4s", len(chunk), b"JSON") + chunk + struct.pack("<I4s", len(data), b"BIN\0") + data
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    return glb_bytes(
+        {key: column.numpy() for key, column in columns.items()},
+        primitive={"mode": 0, "extensions": extension},
+        extensionsUsed=[name],
+    )
 
 
 # -- reading ---------------------------------------------------------------------------------------------

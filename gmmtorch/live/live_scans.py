@@ -33,7 +33,6 @@ from gmmtorch.datasets import (
     Record,
     ScanConversion,
     Sensor,
-    Standing,
     TfPoses,
     Topic,
     TransformTree,
@@ -227,7 +226,7 @@ class LiveScans(Dataset):
     def _settled(self, frame: str) -> PoseSource | None:
         """The source of poses once the fixed frame is clear."""
         if self._options.poses != "tf":
-            return Standing()
+            return PoseSource()
         top = self._options.frame
         source = TfPoses(self._tree, top, self._options.max_gap, f"topic {self.name}")
         chain = source.chain(frame)

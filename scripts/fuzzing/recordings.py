@@ -54,9 +54,6 @@ def bags(folder: Path, scans: list[Any], poses: list[Any]) -> dict[str, Target]:
         write_bag(folder / name, scans, poses)
         mend = mended_mcap if name == "a.mcap" else None
         found[name[2:]] = Target(taken(folder, name), bag, mend)
-        found[f"{name[2:]} intact"] = Target(
-            taken(folder, name), lambda path: datasets.bag_facts(datasets.BagReader(path, True)), mend
-        )
     with BagWriter(folder / "b.mcap") as writer:
         writer.cloud("/a", 0.0, "lidar", np.ones((5, 3)))
         fields = {"header": {"frame_id": "laser"}, "angle_increment": 0.1, "range_max": 9.0}
@@ -134,8 +131,8 @@ def packets(folder: Path) -> dict[str, Target]:
         pcapng += struct.pack("<2I", 6, 12 + len(body)) + body + struct.pack("<I", 12 + len(body))
 
     def capture(path: Path) -> None:
-        for topic in datasets.BagReader(path, True).topics:
-            if topic.type.endswith("Sweep"):
+        for topic in datasets.BagReader(path).topics:
+            if topic.type.endswith("Datagram"):
                 options = {"calibration": str(folder / "os.json")} if topic.name.endswith("3392") else {}
                 read_all("rosbag", path, poses="standing", topic=topic.name, **options)
 
@@ -225,7 +222,7 @@ def logs() -> dict[str, Target]:
 
 def folders(folder: Path) -> dict[str, Target]:
     """Recordings in folders, of which one file is changed, and pictures."""
-    from gmmtorch.datasets.colour_images import read_image
+    from gmmtorch.datasets.depth_images import read_image
 
     rows, pose = b"1 0 0 1 0 1 0 2 0 0 1 3\n" * 2, b"1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n"
     cloud = (folder / "binary.pcd").read_bytes()
@@ -266,7 +263,11 @@ def folders(folder: Path) -> dict[str, Target]:
 
     Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(folder / "a.jpg")
     seeds = {**taken(folder, "a.jpg"), "a.png": png()}
-    return {**found, "colour images": Target(seeds, read_image, mended_png)}
+
+    def colours(path: Path) -> None:
+        read_image(path, str(path), ("JPEG", "PNG"), 1 << 25, "RGB")
+
+    return {**found, "colour images": Target(seeds, colours, mended_png)}
 
 
 def nuscenes() -> dict[str, Target]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -16,24 +15,41 @@ def flaser(readings: list[float], pose: tuple[float, ...] = (0.0, 0.0, 0.0)) -> 
     return " ".join(map(str, words)) + "\n"
 
 
-def pcd(
-    points: list, viewpoint: str = "0 0 0 1 0 0 0", binary: bool = True, announce: int | None = None
-) -> bytes:
-    n = len(points) if announce is None else announce
+def text(table: np.ndarray) -> bytes:
+    """The records of a table, one in each line."""
+    return "".join(" ".join(repr(x.item()) for x in row) + "\n" for row in table).encode()
+
+
+def pcd_of(table: np.ndarray, kinds: str, form: str = "binary", viewpoint: str = "0 0 0 1 0 0 0") -> bytes:
+    """A PCD file of records. kinds: letters of TYPE."""
+    names, n = table.dtype.names, len(table)
     header = (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        f"WIDTH {n}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {n}\nDATA {'binary' if binary else 'ascii'}\n"
+        f"VERSION 0.7\nFIELDS {' '.join(names)}\n"
+        f"SIZE {' '.join(str(table.dtype[name].itemsize) for name in names)}\nTYPE {' '.join(kinds)}\n"
+        f"COUNT {' '.join('1' for _ in names)}\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT {viewpoint}\nPOINTS {n}\n"
+        f"DATA {form}\n"
     )
-    if binary:
-        return header.encode() + b"".join(struct.pack("<3f", *p) for p in points)
-    return (header + "".join("{} {} {}\n".format(*p) for p in points)).encode()
+    return header.encode() + (table.tobytes() if form == "binary" else text(table))
+
+
+def ply_of(table: np.ndarray, form: str = "ascii") -> bytes:
+    """A PLY file of vertices."""
+    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
+    lines = [f"property {names[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names]
+    header = f"ply\nformat {form} 1.0\nelement vertex {len(table)}\n{''.join(lines)}end_header\n"
+    return header.encode() + (text(table) if form == "ascii" else table.tobytes())
+
+
+def cloud(points: list) -> np.ndarray:
+    return np.array([tuple(point) for point in points], [(axis, "<f4") for axis in "xyz"])
+
+
+def pcd(points: list, viewpoint: str = "0 0 0 1 0 0 0", binary: bool = True) -> bytes:
+    return pcd_of(cloud(points), "FFF", "binary" if binary else "ascii", viewpoint)
 
 
 def ply(points: list) -> bytes:
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n" + "".join(
-        f"property float {axis}\n" for axis in "xyz"
-    )
-    return (header + "end_header\n" + "".join("{} {} {}\n".format(*p) for p in points)).encode()
+    return ply_of(cloud(points))
 
 
 def kitti(rotation: np.ndarray, translation: list[float]) -> str:

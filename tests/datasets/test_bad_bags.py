@@ -25,16 +25,6 @@ FORMATS = pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
 
 
 @FORMATS
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
-def test_truncated_bags_are_refused_with_a_repair(tmp_path, suffix, share):
-    path = clouds(tmp_path / f"a.{suffix}")
-    data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(DataError, match=r"a\.(mcap|db3|bag) cannot be read.*(recover|reindex)"):
-        load("rosbag", path, damaged="refuse")
-
-
-@FORMATS
 def test_empty_bags_are_refused(tmp_path, suffix):
     path = tmp_path / f"a.{suffix}"
     path.write_bytes(b"")
@@ -43,7 +33,7 @@ def test_empty_bags_are_refused(tmp_path, suffix):
     path.unlink()
     with BagWriter(path):
         pass
-    with pytest.raises(DataError, match="topics are none"):
+    with pytest.raises(DataError, match=r"topics are none|no message can be read"):
         load("rosbag", path)
 
 
@@ -130,7 +120,7 @@ def test_a_chunk_that_unpacks_without_end_is_refused(tmp_path, suffix, monkeypat
     path = compressed_bag(tmp_path / f"a.{suffix}", "LZ4", np.ones((100_000, 3)))
     assert path.stat().st_size < 20_000
     monkeypatch.setattr(bag_reader, "MAX_CHUNK_BYTES", 1 << 20)
-    with pytest.raises(DataError, match="unpacks to more than"):
+    with pytest.raises(DataError, match=r"a chunk is (too large|damaged)"):
         load("rosbag", path)
 
 
@@ -165,29 +155,18 @@ def test_a_bag_compressed_as_a_whole_is_unpacked_to_a_limit(tmp_path, monkeypatc
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT {} FROM n WHERE x < 0"
 DEFINITION = "x AS id, 'a' AS topic_type, 'a' AS encoding, 'a' AS encoded_message_definition"
 DEFINITION += ", 'a' AS type_description_hash"
-HOSTILE_TABLES = {
-    "schema": ENDLESS.format("x AS schema_version"),
-    "message_definitions": ENDLESS.format(DEFINITION),
-}
 
 
-@pytest.mark.parametrize("is_salvaged", [False, True])
-@pytest.mark.parametrize("name", HOSTILE_TABLES)
-def test_queries_of_a_database_end_whatever_its_views_are(tmp_path, name, is_salvaged):
+def test_queries_of_a_database_end_whatever_its_views_are(tmp_path):
     path = clouds(tmp_path / "a.db3")
     with contextlib.closing(sqlite3.connect(path)) as database:
-        database.execute(f"DROP TABLE IF EXISTS {name}")
-        database.execute(f"CREATE VIEW {name} AS {HOSTILE_TABLES[name]}")
+        database.execute("DROP TABLE IF EXISTS message_definitions")
+        database.execute(f"CREATE VIEW message_definitions AS {ENDLESS.format(DEFINITION)}")
         database.commit()
-    if is_salvaged:
-        assert len(list(BagReader(path, is_salvaged=True).messages({"/points"}))) == 3
-    else:
-        with pytest.raises(DataError, match="more steps than a file of this size needs"):
-            BagReader(path)
+    assert len(list(BagReader(path).messages({"/points"}))) == 3
 
 
-@pytest.mark.parametrize("is_salvaged", [False, True])
-def test_generated_columns_are_not_larger_than_messages(tmp_path, is_salvaged):
+def test_generated_columns_are_not_larger_than_messages(tmp_path):
     path = clouds(tmp_path / "a.db3")
     with contextlib.closing(sqlite3.connect(path)) as database:
         database.executescript(
@@ -196,48 +175,19 @@ def test_generated_columns_are_not_larger_than_messages(tmp_path, is_salvaged):
             "DROP TABLE messages; ALTER TABLE new RENAME TO messages;"
         )
         database.commit()
-    reader = BagReader(path, is_salvaged)
-    if is_salvaged:
-        assert not list(reader.messages({"/points"}))
-    else:
-        with pytest.raises(DataError, match="too big"):
-            list(reader.messages({"/points"}))
+    assert not list(BagReader(path).messages({"/points"}))
 
 
-LAUGHS = (
-    "a{n}: &a{n} [{many}]\n",
-    "a{n}: &a{n}\n  k{n}: 1\n  <<: [{many}]\n",  # rosbags' parser copies what is merged
-)
-
-
-@pytest.mark.parametrize("line", LAUGHS)
-def test_metadata_with_aliases_of_aliases_is_not_read(tmp_path, line, caplog):
+def test_metadata_of_any_content_is_read_in_bounded_time(tmp_path):
     folder = tmp_path / "bag"
     folder.mkdir()
     clouds(folder / "a.db3")
-    lines = [line.format(n=n, many=",".join([f"*a{n - 1}"] * 9)) for n in range(1, 15)]
-    (folder / "metadata.yaml").write_text("a0: &a0 {k: 1}\n" + "".join(lines))
-    begin = time.process_time()
-    assert len(load("rosbag", folder)) > 0
-    assert time.process_time() - begin < 5
-    assert "metadata.yaml is unusable" in caplog.text
-
-
-def test_a_star_in_metadata_is_no_alias(tmp_path, caplog):
-    from gmmtorch.datasets.ros.bag_reader import reader_class
-
-    reader_class(is_ros1=False)
-    from rosbags.rosbag2 import metadata
-
-    assert metadata.YAML(typ="safe").load("a: 'two * three'\nb: x*y\n") == {"a": "two * three", "b": "x*y"}
-    with pytest.raises(Exception, match="aliases are not read"):
-        metadata.YAML(typ="safe").load("a: &x 1\nb: *x\n")
-    begin = time.process_time()
-    for text in ("[" * 3000, "a: " + "{a: " * 5000, "[" * 60 + "]" * 60):
-        with pytest.raises(Exception, match="nested too deeply"):
-            metadata.YAML(typ="safe").load(text)
-    assert time.process_time() - begin < 1
-    assert metadata.YAML(typ="safe").load("[[[]], {a: [1]}]") == [[[]], {"a": [1]}]
+    aliases = [f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 15)]
+    for text in ("a0: &a0 {k: 1}\n" + "".join(aliases), "[" * 100_000, "a: " + "{a: " * 5000):
+        (folder / "metadata.yaml").write_text(text)
+        begin = time.process_time()
+        assert len(load("rosbag", folder)) > 0
+        assert time.process_time() - begin < 5
 
 
 def test_texts_of_a_bag_are_neither_unpickled_nor_run(tmp_path, monkeypatch):

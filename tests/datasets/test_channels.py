@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from datasets.scan_files import depth_folder, kitti
+from datasets.scan_files import depth_folder, kitti, pcd_of, ply_of
 from PIL import Image
 from sensor_bags import BagWriter
 
@@ -27,21 +27,6 @@ def packed(alpha: int = 0) -> np.ndarray:
     return (np.uint32(alpha) << 24) | (red << 16) | (green << 8) | blue
 
 
-def pcd(table: np.ndarray, kinds: str, form: str = "binary") -> bytes:
-    names = table.dtype.names
-    sizes = " ".join(str(table.dtype[n].itemsize) for n in names)
-    header = (
-        f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {sizes}\n"
-        f"TYPE {' '.join(kinds)}\nCOUNT {' '.join('1' for _ in names)}\nWIDTH {len(table)}\nHEIGHT 1\n"
-        f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(table)}\nDATA {form}\n"
-    )
-    return header.encode() + (table.tobytes() if form == "binary" else text(table))
-
-
-def text(table: np.ndarray) -> bytes:
-    return "".join(" ".join(repr(x.item()) for x in row) + "\n" for row in table).encode()
-
-
 def table_of(**columns: np.ndarray) -> np.ndarray:
     whole = {**dict(zip("xyz", PLACES.T, strict=True)), **columns}
     table = np.empty(len(PLACES), [(name, value.dtype) for name, value in whole.items()])
@@ -50,23 +35,12 @@ def table_of(**columns: np.ndarray) -> np.ndarray:
     return table
 
 
-def ply(table: np.ndarray, form: str) -> bytes:
-    names = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
-    lines = [f"property {names[table.dtype[n].str[1:]]} {n}\n" for n in table.dtype.names]
-    header = f"ply\nformat {form} 1.0\nelement vertex {len(table)}\n{''.join(lines)}end_header\n"
-    if form == "ascii":
-        return (
-            header.encode() + "".join(" ".join(repr(x.item()) for x in row) + "\n" for row in table).encode()
-        )
-    return header.encode() + table.tobytes()
-
-
 @pytest.mark.parametrize("alpha", [0, 255])
 @pytest.mark.parametrize("kind", ["F", "U"])
 @pytest.mark.parametrize("name", ["rgb", "rgba"])
 def test_packed_colours_of_pcd_files_are_bits_also_if_they_are_called_floats(tmp_path, alpha, kind, name):
     path = tmp_path / "scan.pcd"
-    path.write_bytes(pcd(table_of(**{name: packed(alpha)}), f"FFF{kind}"))
+    path.write_bytes(pcd_of(table_of(**{name: packed(alpha)}), f"FFF{kind}"))
     assert torch.equal(read_channels(path, ["colour"])["colour"], LINEAR)
 
 
@@ -74,7 +48,7 @@ def test_packed_colours_of_pcd_files_are_bits_also_if_they_are_called_floats(tmp
 def test_packed_colours_of_ascii_pcd_files(tmp_path, as_float):
     path = tmp_path / "scan.pcd"
     colours = packed().view(np.float32) if as_float else packed()
-    path.write_bytes(pcd(table_of(rgb=colours), "FFFF" if as_float else "FFFU", "ascii"))
+    path.write_bytes(pcd_of(table_of(rgb=colours), "FFFF" if as_float else "FFFU", "ascii"))
     torch.testing.assert_close(read_channels(path, ["colour"])["colour"], LINEAR)
 
 
@@ -88,7 +62,7 @@ def test_colours_of_ply_files_of_every_scale(tmp_path, form, scale):
         "0 to 255": COLOURS.astype(np.float32),
     }[scale]
     path = tmp_path / "scan.ply"
-    path.write_bytes(ply(table_of(red=values[:, 0], green=values[:, 1], blue=values[:, 2]), form))
+    path.write_bytes(ply_of(table_of(red=values[:, 0], green=values[:, 1], blue=values[:, 2]), form))
     torch.testing.assert_close(read_channels(path, ["colour"])["colour"], LINEAR)
 
 
@@ -99,7 +73,7 @@ def test_fields_by_their_usual_names_and_by_their_own(tmp_path):
         ring=np.array([7, 8, 9], np.uint8),
     )
     path = tmp_path / "scan.pcd"
-    path.write_bytes(pcd(table, "FFFFUU"))
+    path.write_bytes(pcd_of(table, "FFFFUU"))
     found = read_channels(path, ["intensity", "class", "ring", "colour"])
     assert found.keys() == {"intensity", "class", "ring"}
     assert found["intensity"].tolist()[0] == 1.5
@@ -147,8 +121,8 @@ def test_a_scan_folder_keeps_channels_with_their_points_and_counts_scans_without
     (tmp_path / "poses.txt").write_text(2 * IDENTITY)
     far = table_of(intensity=np.array([1, 2, 3], np.float32))
     far["x"][1] = np.nan
-    (tmp_path / "scans" / "0.pcd").write_bytes(pcd(far, "FFFF"))
-    (tmp_path / "scans" / "1.pcd").write_bytes(pcd(table_of(), "FFF"))
+    (tmp_path / "scans" / "0.pcd").write_bytes(pcd_of(far, "FFFF"))
+    (tmp_path / "scans" / "1.pcd").write_bytes(pcd_of(table_of(), "FFF"))
     data = load("scan_folder", tmp_path, max_range=3.2, no_return_range=1.0, attributes=["intensity"])
     assert data[0].attributes["intensity"].flatten().tolist() == [1.0]  # NaN is dropped, 3.3 m is no return
     assert data[1].attributes == {}

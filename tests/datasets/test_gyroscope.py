@@ -169,22 +169,18 @@ def test_a_gap_within_the_bound_is_interpolated(tmp_path):
     np.testing.assert_allclose(angles(turns), 0.1 * np.arange(0.05, 2, 0.1), atol=1e-9)
 
 
-def test_a_bag_without_an_imu_or_with_several_lists_its_topics(tmp_path):
+def test_the_imu_with_most_messages_is_read(tmp_path):
     path = tmp_path / "a.mcap"
     with BagWriter(path) as bag:
         bag.cloud("/points", 0.0, "lidar", POINTS)
-    with pytest.raises(InvalidArgumentError, match=r"has no topic of type sensor_msgs/Imu.*only none"):
+    with pytest.raises(InvalidArgumentError, match=r"has no topic of type sensor_msgs/Imu"):
         standing(path).turns()
     with BagWriter(path) as bag:
         for time in range(21):
             bag.cloud("/points", time / 10, "lidar", POINTS)
-        write_imu(bag, TIMES, STEADY, "lidar")
+        write_imu(bag, TIMES[::2], STEADY[::2], "lidar")
         write_imu(bag, TIMES, 2 * STEADY, "lidar", topic="/other/imu")
-    with pytest.raises(InvalidArgumentError, match=r"2 topics of an IMU: /imu .*201 messages.*/other/imu"):
-        standing(path).turns()
-    with pytest.raises(InvalidArgumentError, match=r"imu_topic=/points .*only /imu"):
-        standing(path, imu_topic="/points").turns()
-    np.testing.assert_allclose(angles(standing(path, imu_topic="/other/imu").turns()), 0.2, atol=1e-9)
+    np.testing.assert_allclose(angles(standing(path).turns()), 0.2, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +193,7 @@ def test_a_bag_without_an_imu_or_with_several_lists_its_topics(tmp_path):
 )
 def test_an_imu_without_usable_rates_is_refused(tmp_path, fields, rates, reason):
     dataset = standing(steady(tmp_path / "a.mcap", TIMES, rates, **fields))
-    with pytest.raises(InvalidArgumentError, match=rf"topic /imu has 0 usable.*{reason}.*imu_topic"):
+    with pytest.raises(InvalidArgumentError, match=rf"topic /imu has 0 usable.*{reason}"):
         dataset.turns()
 
 

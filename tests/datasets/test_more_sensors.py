@@ -120,19 +120,6 @@ def test_a_message_without_packets_has_no_points():
     assert len(LidarPackets().points({"packets": []}).points) == 0
 
 
-def test_packets_without_a_definition_in_the_bag_are_read(tmp_path):
-    """As bags of SQLite before ROS 2 Iron are."""
-    pytest.importorskip("velodyne_decoder")
-    import sqlite3
-
-    path = packets(tmp_path / "a.db3")
-    database = sqlite3.connect(path)
-    database.execute("DELETE FROM message_definitions")
-    database.commit()
-    database.close()
-    assert len(load("rosbag", path)[0].points) == N_PACKETS * 12 * 32
-
-
 # -- E57, written by libE57 ------------------------------------------------------------------------
 
 

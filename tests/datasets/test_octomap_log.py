@@ -168,7 +168,7 @@ def test_a_graph_that_is_cut_off_is_refused(tmp_path):
     ("content", "words"),
     [
         (graph([]), "has no scan"),
-        (struct.pack("<II", 1 << 24, 7), "ends within scan 0"),
+        (struct.pack("<II", 1 << 24, 7), "scan 0 announces 7 points"),
         (struct.pack("<II", 1, 2**32 - 1) + bytes(100), "announces 4294967295 points"),
         (struct.pack("<II", 1, 0) + bytes(100), "no pose where one is expected"),
         (b"\x89PNG\r\n\x1a\n" + bytes(500), "no NODE line"),

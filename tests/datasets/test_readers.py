@@ -11,7 +11,6 @@ import torch
 from scan_files import TURN_LEFT, flaser, kitti, pcd, ply, scan_folder
 
 from gmmtorch.datasets import load
-from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.scan_logs import beam_angles
 from gmmtorch.errors import DataError
 
@@ -177,27 +176,6 @@ def test_scan_folder_reports_missing_files(tmp_path):
     (tmp_path / "poses.txt").unlink()
     with pytest.raises(DataError, match=r"poses\.txt is missing"):
         load("scan_folder", tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("0.pcd", pcd([(1.0, 2.0, 3.0)] * 100)[:-500]),
-        ("0.pcd", pcd([(1.0, 2.0, 3.0)] * 3, binary=False, announce=5)),
-        ("0.pcd", pcd([(1.0, 2.0, 3.0)])[:60]),
-        ("0.pcd", b"\x89PNG\r\n\x1a\n" + bytes(200)),
-        ("0.pcd", b""),
-        ("0.ply", ply([(1.0, 2.0, 3.0)] * 100)[:-500]),
-        ("0.ply", b"this is not a ply file"),
-        ("0.ply", b""),
-    ],
-    ids=["short", "short-ascii", "header-cut", "png", "empty", "short-ply", "text-ply", "empty-ply"],
-)
-def test_read_cloud_rejects_damaged_files(tmp_path, name, content):
-    path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(DataError, match=name):
-        read_cloud(path)
 
 
 # PCD files in the world frame

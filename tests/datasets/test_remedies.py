@@ -148,7 +148,6 @@ CASES = {
         bag(("map", "base"), frames=("map", "map")), {"poses": "FILE"}
     ),
     "two cameras": Case(two_infos),
-    "no such camera": Case(two_infos, {"camera_info": "/left"}),
     "no camera": Case(depth_bag()),
     "another size": Case(depth_bag(camera(width=99))),
     "unknown lens": Case(depth_bag(camera(d=np.ones(4), distortion_model="odd"))),
@@ -236,12 +235,11 @@ def metadata(storage: str = "mcap", files: str = "a 0.mcap", version: int = 9) -
     ],
 )
 @pytest.mark.parametrize("name", ["a 0.mcap", "a 0.db3"])
-def test_the_only_file_of_a_bag_is_read_by_its_own_magic(tmp_path, caplog, text, name):
+def test_the_only_file_of_a_bag_is_read_by_its_own_magic(tmp_path, text, name):
     """The content is that of MCAP."""
     text = text.replace("a 0.mcap", name)
     dataset = load("rosbag", folder_of(name, metadata=text)(tmp_path))
     assert [len(scan.points) for scan in dataset] == [2, 2]
-    assert f"metadata.yaml is unusable; {name} is read without it" in caplog.text
 
 
 def test_a_folder_with_several_files_asks_for_one(tmp_path):
@@ -252,10 +250,10 @@ def test_a_folder_with_several_files_asks_for_one(tmp_path):
 
 
 @pytest.mark.parametrize("files", ["a 0.mcap, a 1.mcap", "a 1.mcap"])
-def test_a_bag_that_misses_a_file_is_refused(tmp_path, files):
+def test_a_bag_that_misses_a_file_says_so(tmp_path, caplog, files):
     path = folder_of("a 0.mcap", metadata=metadata(files=files))(tmp_path)
-    with pytest.raises(GmmTorchError, match=r"files are missing.*a 1\.mcap"):
-        load("rosbag", path, damaged="refuse")
+    assert len(load("rosbag", path)) == 2
+    assert "nothing can be read of a 1.mcap" in caplog.text
 
 
 def test_remedies_of_kitti_are_applied(tmp_path):

@@ -345,6 +345,6 @@ def test_without_rosbags_the_error_states_the_install_command(tmp_path, monkeypa
     import sys
 
     path = clouds(tmp_path / "a.mcap")
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(GmmTorchError, match=r"pip install 'gmmtorch\[bags\]'"):
         load("rosbag", path)

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from gmmtorch import datasets
 from gmmtorch.cli import inputs
-from gmmtorch.datasets import NANOSECONDS, NO_POSE, BagFacts, BagReader, Dataset, bag_facts, whole_or_intact
+from gmmtorch.datasets import NANOSECONDS, NO_POSE, BagFacts, BagReader, Dataset, bag_facts
 from gmmtorch.errors import GmmTorchError, printable, told
 from gmmtorch.report import Row, byte_text, count_text, format_table
 
@@ -120,9 +120,7 @@ def _bag(options: DictConfig) -> BagFacts | None:
     """The facts of a bag, printed; None if it cannot be read at all, which the data set's error explains."""
     path = Path(str(options.path)).expanduser()
     try:
-        facts = whole_or_intact(
-            lambda is_salvaged: bag_facts(BagReader(path, is_salvaged)), options.damaged == "read"
-        )
+        facts = bag_facts(BagReader(path))
     except GmmTorchError as error:
         _print_wrapped("\ndamage     ", f"the messages cannot be read: {error}")
         return None

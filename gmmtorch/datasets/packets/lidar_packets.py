@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ class LidarPackets:
         self._recording = recording
         self._angles: hesai.Angles | None = None
         self._metadata: ouster.Metadata | None = None
-        self._velodyne: _Velodyne | None = None
+        self._decoder: Callable[[list[tuple[float, bytes]]], np.ndarray] | None = None
 
     def points(self, message: dict[str, Any], wanted: Sequence[str] = ()) -> Reading:
         """The points of a message with packets, with times in ns on the clock of the packets' stamps.
@@ -48,9 +48,7 @@ class LidarPackets:
             return reading(np.empty((0, 3)), None, None)
         model = hesai.model_of(packets[0])
         if len(packets[0]) == VELODYNE_BYTES:
-            if self._velodyne is None:
-                self._velodyne = _Velodyne()
-            return self._velodyne.points(message, packets, wanted)
+            return self._velodyne(message, packets, wanted)
         if model is not None:
             if self._path is not None and self._angles is None:
                 self._angles = hesai.read_angles(self._path)
@@ -62,6 +60,17 @@ class LidarPackets:
         stamp = message["packets"][0]["stamp"]
         first = int(stamp["sec"]) * NANOSECONDS + int(stamp["nanosec"])
         return _reading(found.points, found.times + first, found.reflectivity, wanted)
+
+    def _velodyne(self, message: dict[str, Any], packets: Sequence[bytes], wanted: Sequence[str]) -> Reading:
+        self._decoder = self._decoder or _velodyne_decoder()
+        if any(len(data) != VELODYNE_BYTES for data in packets):
+            raise DataError(f"not all packets have {VELODYNE_BYTES} bytes")
+        stamps = [
+            int(one["stamp"]["sec"]) + int(one["stamp"]["nanosec"]) * 1e-9 for one in message["packets"]
+        ]
+        table = self._decoder(list(zip(stamps, packets, strict=True)))
+        points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
+        return _reading(points, table["time"], table["intensity"], wanted)
 
     def _ouster(self, n_bytes: int) -> ouster.Metadata:
         """The metadata of the lidar, whose packets have a size."""
@@ -91,32 +100,24 @@ def _checked(path: Path) -> Path:
     return path
 
 
-class _Velodyne:
-    """Decodes packets with the package velodyne-decoder.
+def _velodyne_decoder() -> Callable[[list[tuple[float, bytes]]], np.ndarray]:
+    """A function that decodes (time in s, packet) of a sweep with the package velodyne-decoder.
 
     The first packet states the model, except for the HDL-64E.
     """
+    with needs_extra("Velodyne packets need", "velodyne-decoder", "packets"):
+        import velodyne_decoder
+    decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config())
 
-    def __init__(self) -> None:
-        with needs_extra("Velodyne packets need", "velodyne-decoder", "packets"):
-            import velodyne_decoder
-        self._package: Any = velodyne_decoder
-        self._decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config())
-
-    def points(self, message: dict[str, Any], packets: Sequence[bytes], wanted: Sequence[str]) -> Reading:
-        made = []
-        for packet, data in zip(message["packets"], packets, strict=True):
-            if len(data) != VELODYNE_BYTES:
-                raise DataError(f"a packet has {len(data)} bytes instead of {VELODYNE_BYTES}")
-            stamp = packet["stamp"]
-            made.append((int(stamp["sec"]) + int(stamp["nanosec"]) * 1e-9, list(data)))
+    def decode(packets: list[tuple[float, bytes]]) -> np.ndarray:
         try:
-            given = [self._package.VelodynePacket(*one) for one in made]
-            _, table = self._decoder.decode(given, as_pcl_structs=True)
+            given = [velodyne_decoder.VelodynePacket(time, list(data)) for time, data in packets]
+            table: np.ndarray = decoder.decode(given, as_pcl_structs=True)[1]
         except (RuntimeError, TypeError, ValueError) as error:
             raise DataError(f"the packets cannot be decoded: {str(error).splitlines()[0]}") from error
-        points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
-        return _reading(points, table["time"], table["intensity"], wanted)
+        return table
+
+    return decode
 
 
 # -- metadata beside a recording ---------------------------------------------------------------------

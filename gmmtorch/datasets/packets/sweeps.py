@@ -10,11 +10,10 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 from gmmtorch.datasets.packets import hesai, ouster
 from gmmtorch.datasets.packets.captures import Capture, Datagram
+from gmmtorch.datasets.ros.bag_files import Connection
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError
 
@@ -32,7 +31,13 @@ DEFINITION = (
     "MSG: lidar_packets/Packet\nbuiltin_interfaces/Time stamp\nuint8[] data\n"
 )
 
-SINGLE_PACKETS = {"ouster_ros/msg/PacketMsg": "os_sensor", "ouster_sensor_msgs/msg/PacketMsg": "os_sensor"}
+PACKET = "lidar_packets/msg/Datagram"
+"""The type of datagrams in a capture."""
+SINGLE_PACKETS = {
+    "ouster_ros/msg/PacketMsg": "os_sensor",
+    "ouster_sensor_msgs/msg/PacketMsg": "os_sensor",
+    PACKET: "",
+}
 """Messages with one packet and no header, which are read as sweeps, and the frame of their lidars."""
 
 
@@ -41,8 +46,10 @@ def is_lidar(data: bytes) -> bool:
     return len(data) == VELODYNE_BYTES or hesai.model_of(data) is not None or ouster.is_packet(data)
 
 
-def packet_of(message: bytes, is_ros1: bool) -> bytes:
+def packet_of(message: bytes, kind: str, is_ros1: bool) -> bytes:
     """The packet in a message of `SINGLE_PACKETS`."""
+    if kind == PACKET:
+        return message
     at = 0 if is_ros1 else 4
     is_big = not is_ros1 and message[1:2] == b"\0"
     return message[at + 4 :][: int.from_bytes(message[at : at + 4], "big" if is_big else "little")]
@@ -97,66 +104,44 @@ def packed(sweep: Sequence[tuple[int, bytes]], frame: str, is_ros1: bool) -> byt
     return bytes(found) if is_ros1 else b"\0\1\0\0" + found
 
 
-def definition(text: str) -> SimpleNamespace:
-    """A definition of a message, as those of a reader of rosbags."""
-    return SimpleNamespace(format=SimpleNamespace(name="MSG"), data=text)
-
-
 # -- captures ----------------------------------------------------------------------------------------
 
 
 class CaptureMessages:
-    """The packets of lidars in a network capture as messages of sweeps. Each sender and port is a topic.
+    """The UDP datagrams in a network capture as messages. Each sender and port is a topic.
 
     Attributes:
-        connections: as those of a reader of rosbags.
+        connections: of lidars, and of other senders.
         damage: of the file, see `Capture`.
 
     Raises `DataError` if the file is not a capture, or has no UDP datagram.
     """
 
     def __init__(self, path: Path) -> None:
-        counts, n_sweeps = Counter[tuple[str, int]](), Counter[tuple[str, int]]()
-        turns: dict[tuple[str, int], Sweeps] = {}
+        counts, lidars = Counter[str](), set[str]()
 
         def note(one: Datagram) -> None:
-            key = one.source, one.port
-            if key not in counts and len(counts) >= _MOST_TOPICS:
-                return
-            counts[key] += 1
-            if is_lidar(one.data):
-                n_sweeps[key] += bool(turns.setdefault(key, Sweeps()).add(one.time, one.data))
+            topic = f"/{one.source}/{one.port}"
+            if topic in counts or len(counts) < _MOST_TOPICS:
+                counts[topic] += 1
+                if is_lidar(one.data):
+                    lidars.add(topic)
 
         self._capture = Capture(path, note)
         self.damage = self._capture.damage
         if not counts:
             raise DataError(f"{path} contains no UDP datagram over IPv4; capture the port of the lidar.")
-        self.connections: list[Any] = []
-        for (source, port), n_datagrams in counts.items():
-            is_lidar_here = (source, port) in turns
-            self.connections.append(
-                SimpleNamespace(
-                    id=len(self.connections),
-                    topic=f"/{source}/{port}",
-                    msgtype=SWEEP if is_lidar_here else _DATAGRAMS,
-                    msgcount=n_sweeps[source, port] + 1 if is_lidar_here else n_datagrams,
-                    msgdef=definition(DEFINITION if is_lidar_here else ""),
-                )
-            )
+        self.connections = [
+            Connection(number, topic, PACKET if topic in lidars else _DATAGRAMS, n_messages=n)
+            for number, (topic, n) in enumerate(counts.items())
+        ]
 
     def messages(
-        self, connections: Collection[Any], start: int | None = None
-    ) -> Iterator[tuple[Any, int, bytes]]:
-        """(connection, time in ns, content) of the sweeps of some topics, from a time on."""
-        wanted = {one.topic: (one, Sweeps()) for one in connections if one.msgtype == SWEEP}
+        self, connections: Collection[Connection], start: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """(connection, time in ns, content) of the datagrams of some topics, from a time on."""
+        wanted = {one.topic: one for one in connections}
         for one in self._capture.datagrams(start):
             found = wanted.get(f"/{one.source}/{one.port}")
-            if found is not None and is_lidar(one.data):
-                yield from _message(found[0], found[1].add(one.time, one.data))
-        for connection, sweeps in wanted.values():
-            yield from _message(connection, sweeps.rest())
-
-
-def _message(connection: Any, sweep: list[tuple[int, bytes]]) -> Iterator[tuple[Any, int, bytes]]:
-    if sweep:
-        yield connection, sweep[0][0], packed(sweep, "", is_ros1=False)
+            if found is not None:
+                yield found, one.time, one.data

@@ -1,7 +1,4 @@
-"""LAS and LAZ files. Headers are checked against the size of the file before anything is allocated.
-
-Offsets are those of the LAS specification 1.4 (ASPRS) and of the LASzip specification of its chunk table.
-"""
+"""LAS and LAZ files. Headers are checked against the size of the file before anything is allocated."""
 
 from __future__ import annotations
 
@@ -19,122 +16,71 @@ from gmmtorch.optional_packages import needs_extra
 
 _LAS_BLOCK_BYTES = 1 << 25
 """Limit of one read: a point may announce 64 kB of extra bytes."""
-_HEADER = struct.Struct("<4s20x2B68xHIIBHI")  # to the number of points, 111 bytes
-_HEADER_BYTES = {0: 227, 1: 227, 2: 227, 3: 235, 4: 375, 5: 393}
-_RECORD_HEADER = struct.Struct("<2x16sHH32x")
-_COMPRESSED = 0x80
-_LASZIP = (b"laszip encoded", 22204)
-_LASZIP_ITEMS = 34
-_LASZIP_CHUNK = 12
+_SIZES = struct.Struct("<4s20x2B68xHII")  # of the header, to the number of its records, 104 bytes
+_RECORD_BYTES = 54  # of a variable-length record, at least
 _MAX_CHUNK_POINTS = 1 << 22
 """Writers use 50 000. The decompressor allocates about 32 bytes for each point of a chunk."""
-_CHUNKS_VARY = 0xFFFFFFFF
 
 
-def read_las_header(path: Path) -> tuple[int, int]:
-    """The number of points of a LAS or LAZ file, and the bytes of an uncompressed point.
+def _checked_header(path: Path) -> Any:
+    """The header of a LAS or LAZ file by laspy.
 
-    Raises `DataError` if the file is shorter than its header, its variable-length records, its chunk table
-    or its uncompressed points.
+    Raises `DataError` if the file is shorter than its header, its variable-length records, its chunk table or
+    its uncompressed points.
     """
+    import laspy
+
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES[5])
-        if len(head) < _HEADER_BYTES[0] or head[:4] != b"LASF":
-            raise _damaged(path, "it does not begin with a LAS header")
-        _, major, minor, header_size, data_start, n_records, form, point_bytes, n_points = (
-            _HEADER.unpack_from(head)
-        )
-        if major != 1 or minor not in _HEADER_BYTES or len(head) < _HEADER_BYTES[minor]:
-            raise _damaged(path, f"its version {major}.{minor} is not one of 1.0 to 1.5")
-        if minor >= 4:
-            (n_points,) = struct.unpack_from("<Q", head, 247)
-        if not _HEADER_BYTES[minor] <= header_size <= data_start <= size:
-            raise _damaged(
-                path,
-                f"its header of {header_size} bytes and points from byte {data_start} need more than {size}",
-            )
-        if n_records * _RECORD_HEADER.size > data_start - header_size:
-            raise _damaged(path, f"{n_records} variable-length records do not fit before its points")
-        if point_bytes < 20:
-            raise _damaged(path, f"a point has {point_bytes} bytes; at least 20 are needed")
-        if form & _COMPRESSED:
-            file.seek(header_size)
-            record = _laszip_record(path, file.read(data_start - header_size), n_records, point_bytes)
-            _check_chunks(path, file, data_start, size, n_points, record)
-        elif n_points * point_bytes > size - data_start:
-            raise _damaged(
-                path,
-                f"it announces {n_points} points of {point_bytes} bytes, but has {size - data_start} bytes",
-            )
-    return n_points, point_bytes
+        magic, major, minor, header_size, start, n_records = _SIZES.unpack(file.read(_SIZES.size))
+        if major != 1 or minor > 5:
+            raise ValueError(f"its version {major}.{minor} is not one of 1.0 to 1.5")
+        if magic != b"LASF" or not header_size + n_records * _RECORD_BYTES <= start <= size:
+            raise ValueError(f"its {n_records} variable-length records do not end at byte {start} of {size}")
+        file.seek(0)
+        header = laspy.LasHeader.read_from(file)
+        n_points, point_bytes = int(header.point_count), int(header.point_format.size)
+        if header.are_points_compressed:
+            _check_chunks(file, start, size, n_points, header)
+        elif n_points * point_bytes > size - start:
+            raise ValueError(f"{n_points} points of {point_bytes} bytes do not fit into {size - start} bytes")
+        if not (np.isfinite(header.offsets).all() and np.isfinite(header.scales).all()):
+            raise ValueError(f"its scales are {header.scales}, its offsets {header.offsets}")
+        if not (header.scales > 0).all():
+            raise ValueError(f"its scales are {header.scales}")
+    return header
 
 
-def _laszip_record(path: Path, records: bytes, n_records: int, point_bytes: int) -> bytes:
-    """The compressor's record, if it describes points of `point_bytes`."""
-    start = 0
-    for _ in range(n_records):
-        if start + _RECORD_HEADER.size > len(records):
-            break
-        user, number, length = _RECORD_HEADER.unpack_from(records, start)
-        start += _RECORD_HEADER.size
-        content = records[start : start + length]
-        start += length
-        if (user.split(b"\0")[0], number) != _LASZIP:
-            continue
-        count = (
-            struct.unpack_from("<H", content, _LASZIP_ITEMS - 2)[0] if len(content) >= _LASZIP_ITEMS else 0
-        )
-        items = content[_LASZIP_ITEMS : _LASZIP_ITEMS + 6 * count]
-        widths = (
-            [width for _, width, _ in struct.iter_unpack("<HHH", items)] if len(items) == 6 * count else []
-        )
-        if sum(widths) != point_bytes:
-            raise _damaged(path, "its LASzip record does not describe its points")
-        (chunk_points,) = struct.unpack_from("<I", content, _LASZIP_CHUNK)
-        if chunk_points > _MAX_CHUNK_POINTS and chunk_points != _CHUNKS_VARY:
-            raise _damaged(
-                path, f"its chunks have {chunk_points:,} points; at most {_MAX_CHUNK_POINTS:,} are read"
-            )
-        return content
-    raise _damaged(path, "its points are compressed, but the LASzip record is missing")
-
-
-def _check_chunks(
-    path: Path, file: BinaryIO, data_start: int, size: int, n_points: int, record: bytes
-) -> None:
+def _check_chunks(file: BinaryIO, start: int, size: int, n_points: int, header: Any) -> None:
     """Checks the position, the length and the sums of the table of compressed chunks.
 
     A chunk has at least one byte; the decompressor allocates the whole table, and each chunk.
     """
     import lazrs
 
-    file.seek(data_start)
-    start = file.read(8)
-    table = struct.unpack("<q", start)[0] if len(start) == 8 else -1
-    if table == -1 and len(start) == 8:  # written to a stream: the position is at the end of the file
-        file.seek(max(data_start, size - 8))
-        table = struct.unpack("<q", file.read(8).rjust(8, b"\0"))[0]
+    record = lazrs.LazVlr(header.vlrs.get("LasZipVlr")[0].record_data)
+    if record.item_size() != header.point_format.size:
+        raise ValueError("its LASzip record does not describe its points")
+    if not record.uses_variable_size_chunks() and record.chunk_size() > _MAX_CHUNK_POINTS:
+        raise ValueError(f"its chunks have {record.chunk_size():,} points, more than {_MAX_CHUNK_POINTS:,}")
     if n_points == 0:
         return
-    if not data_start + 8 <= table <= size - 8:
-        raise _damaged(path, f"its table of chunks at byte {table} is outside of its {size} bytes")
+    file.seek(start)
+    (table,) = struct.unpack("<q", file.read(8))
+    if table == -1:  # written to a stream: the position is at the end of the file
+        file.seek(max(start, size - 8))
+        (table,) = struct.unpack("<q", file.read(8))
+    if not start + 8 <= table <= size - 8:
+        raise ValueError(f"its table of chunks at byte {table} is outside of its {size} bytes")
     file.seek(table + 4)
     (n_chunks,) = struct.unpack("<I", file.read(4))
-    if n_chunks > table - data_start - 8:
-        raise _damaged(path, f"{n_chunks} chunks do not fit into {table - data_start - 8} bytes")
-    file.seek(data_start)
-    chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
-    if sum(n_bytes for _, n_bytes in chunks) > table - data_start - 8:
-        raise _damaged(path, f"its chunks do not fit into {table - data_start - 8} bytes")
-    if max(count for count, _ in chunks) > _MAX_CHUNK_POINTS:
-        raise _damaged(path, f"a chunk has more than {_MAX_CHUNK_POINTS:,} points")
-
-
-def _damaged(path: Path, reason: str) -> DataError:
-    return DataError(
-        f"{path} cannot be read as LAS or LAZ: {reason}; it is truncated or damaged. Write or fetch it again."
-    )
+    left = table - start - 8
+    if n_chunks > left:
+        raise ValueError(f"{n_chunks} chunks do not fit into {left} bytes")
+    file.seek(start)
+    chunks = lazrs.read_chunk_table(file, record)
+    if sum(n_bytes for _, n_bytes in chunks) > left or max(n for n, _ in chunks) > _MAX_CHUNK_POINTS:
+        raise ValueError(f"its chunks do not fit into {left} bytes, or one is too large")
 
 
 class LasRows:
@@ -153,18 +99,9 @@ class LasRows:
         self._path, self._names, self.dim = path, names, len(names)
         self.name = path.stem
         with _las_errors(path):
-            self.n_rows, self._point_bytes = read_las_header(path)
-        with _las_errors(path), self._open() as reader:
-            if int(reader.header.point_count) != self.n_rows:
-                raise DataError(f"{path} announces two numbers of points; it is damaged. Write it again.")
-            self.fields = {d.name: np.dtype(d.dtype or "<u1") for d in reader.header.point_format}
-            scales, offsets = (
-                np.asarray(of, np.float64) for of in (reader.header.scales, reader.header.offsets)
-            )
-            if not (np.isfinite(offsets).all() and np.isfinite(scales).all() and (scales > 0).all()):
-                raise DataError(
-                    f"{path} has scales {scales} and offsets {offsets}; it is damaged. Write it again."
-                )
+            header = _checked_header(path)
+        self.n_rows, self._point_bytes = int(header.point_count), int(header.point_format.size)
+        self.fields = {d.name: np.dtype(d.dtype or "<u1") for d in header.point_format}
 
     def _open(self) -> Any:
         return self._laspy.open(self._path, read_evlrs=False)

@@ -10,7 +10,7 @@ from array import array
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,31 +28,21 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.pose import Pose
 
 
-class PoseSource(Protocol):
-    """Poses of the sensor in a fixed frame."""
-
-    can_deskew: bool
-
-    def at(self, times: np.ndarray, frame: str) -> PosesAt:
-        """Poses of the sensor frame at times (M,) in ns."""
-
-    def explain(self, time: int, frame: str) -> str:
-        """Why the pose at a time is unknown, for messages."""
-
-
-class Standing:
-    """A sensor that does not move: its frame is the world."""
+class PoseSource:
+    """Poses of a sensor in a fixed frame; here, of one that does not move: its frame is the world."""
 
     can_deskew = False
 
     def at(self, times: np.ndarray, frame: str) -> PosesAt:
+        """Poses of the sensor frame at times (M,) in ns."""
         return PosesAt(Pose.identity(3, len(times)), np.ones(len(times), bool))
 
     def explain(self, time: int, frame: str) -> str:
+        """Why the pose at a time is unknown, for messages."""
         return "all poses are known"
 
 
-class TfPoses:
+class TfPoses(PoseSource):
     """Poses from TF.
 
     top: the fixed frame; None: the root of the tree of the sensor's frame. where: the topic, for messages.
@@ -92,15 +82,10 @@ class TfPoses:
         return self._tree.unknown_step(self.chain(frame), time, self._max_gap)
 
 
-class BodyPoses:
-    """Poses of a body from a trajectory, and the sensor's pose on it.
+class BodyPoses(PoseSource):
+    """Poses of a body from a trajectory (world ← body), and those of sensors on it (body ← sensor) by frame.
 
-    Args:
-        trajectory: world ← body.
-        mounts: body ← sensor for each frame of a sensor.
-        max_gap: longest time in seconds between two poses to interpolate.
-        name: of the trajectory, for messages.
-        can_deskew: False if it has poses at the stamps of scans only.
+    max_gap: see `Trajectory.at`. name: for messages. can_deskew: False with poses at stamps of scans only.
     """
 
     def __init__(
@@ -125,13 +110,11 @@ class BodyPoses:
         return f"{self._name} has poses from {times[0]:.3f} to {times[-1]:.3f} s"
 
 
-class RegisteredPoses:
+class RegisteredPoses(PoseSource):
     """Poses of a sensor whose points are in a fixed frame already, as SLAM systems publish them.
 
     source: poses of the sensor. sensor: its frame. fixed: poses of the frame of the points.
     """
-
-    can_deskew = False
 
     def __init__(self, source: PoseSource, sensor: str, fixed: PoseSource) -> None:
         self.sensor, self._source, self._fixed = sensor, source, fixed
@@ -364,7 +347,7 @@ class BagSurvey:
             sensors = frames if seen_from is None else [seen_from]
             mounts = {frame: self._mount(frame, where) if mount is None else mount for frame in sensors}
             source = BodyPoses(trajectory, mounts, self.max_gap, f"topic {self._pose_topic}")
-            return source if seen_from is None else RegisteredPoses(source, seen_from, Standing())
+            return source if seen_from is None else RegisteredPoses(source, seen_from, PoseSource())
         if len(frames) > 1:
             best = next(frame for frame, _ in frames.most_common() if frame)
             raise InvalidArgumentError(
@@ -372,7 +355,7 @@ class BagSurvey:
                 f"‹sensor_frame›={best}."
             )
         if self._file is None:
-            return Standing()
+            return PoseSource()
         if seen_from is not None:
             raise InvalidArgumentError(
                 f"‹poses›={self._poses} would move the points of {where} again: they are in the fixed "

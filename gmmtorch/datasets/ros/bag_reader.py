@@ -1,24 +1,20 @@
-"""Reads ROS bags: ROS 1 (.bag), ROS 2 SQLite (.db3) and MCAP (.mcap), with the package rosbags; and network
-captures of lidars.
+"""Reads ROS bags: ROS 1 (.bag), ROS 2 SQLite (.db3) and MCAP (.mcap), and network captures of lidars.
 
 Bags are hostile input. Files are read within their length, compressed chunks are unpacked up to a limit, and
 messages are decoded by `MessageDecoder`; definitions in a bag are used only for types that ROS does not have.
+The package rosbags knows the types of ROS and parses definitions.
 """
 
 from __future__ import annotations
 
 import bz2
-import io
-import itertools
-import logging
 import re
 import shutil
 import tempfile
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 from gmmtorch.datasets.packets.captures import SUFFIXES as CAPTURES
 from gmmtorch.datasets.packets.sweeps import DEFINITION as SWEEP_DEFINITION
@@ -27,21 +23,23 @@ from gmmtorch.datasets.packets.sweeps import (
     SWEEP,
     CaptureMessages,
     Sweeps,
-    definition,
     is_lidar,
     packed,
     packet_of,
 )
+from gmmtorch.datasets.ros.bag_files import BagFiles
 from gmmtorch.datasets.ros.message_decoder import MessageDecoder
-from gmmtorch.datasets.ros.salvage import QuerySteps, Salvage
 from gmmtorch.datasets.trajectory import NANOSECONDS
-from gmmtorch.errors import DataError, GmmTorchError
+from gmmtorch.errors import DataError
 from gmmtorch.optional_packages import needs_extra
 
-_log = logging.getLogger(__name__)
 _SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
+_PACKED = ".zstd"
+"""Suffix of a file that is compressed as a whole."""
+_BLOCK_BYTES = 1 << 20
+_MOST_METADATA = 1 << 22  # characters
 _LEAST_MISSING = 0.05  # s at the end of a bag, below which it is whole
 _REPAIRS = {
     ".bag": "'rosbag reindex' repairs a recording that was interrupted",
@@ -76,46 +74,39 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class DamagedBagError(DataError):
-    """A bag cannot be read as a whole."""
-
-
 class BagReader:
     """The topics and messages of one bag.
 
-    Args:
-        path: a .bag, .mcap or .db3 file, or the folder of a ROS 2 bag.
-        is_salvaged: whether the intact part of a damaged bag is read.
+    path: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or a network capture. Of a damaged bag the
+    intact part is read.
 
-    Raises `DamagedBagError`, which states a repair, if the bag is damaged, and `GmmTorchError` without
-    rosbags.
+    Raises `DataError`, which states a repair, if nothing can be read, and `GmmTorchError` without rosbags.
     """
 
-    def __init__(self, path: Path, is_salvaged: bool = False) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = _bag_file(path)
+        with needs_extra("ROS bags and network captures need", "rosbags", "bags"):
+            import rosbags.rosbag2  # noqa: F401
         self._is_ros1 = self.path.suffix == ".bag"
-        with self._errors():
-            self._reader: Any = self._salvaged() if is_salvaged else self._opened()
-            self._connections = [
-                c for c in self._reader.connections if isinstance(c.topic, str) and isinstance(c.msgtype, str)
-            ]  # columns of a damaged database can be empty
-            sweep = parsed_definitions(definition(SWEEP_DEFINITION), SWEEP)
-            self._decoder = MessageDecoder(
-                {
-                    **self._own_definitions(),
-                    **dict.fromkeys(SINGLE_PACKETS, sweep[SWEEP]),
-                    **sweep,
-                    **standard_definitions(self._is_ros1),
-                },
-                packed=self._is_ros1,
-            )
+        self._reader = CaptureMessages(self.path) if self.path.suffix in CAPTURES else self._opened()
+        self._connections = self._reader.connections
+        sweep = parsed_definitions("MSG", SWEEP_DEFINITION, SWEEP)
+        self._decoder = MessageDecoder(
+            {
+                **self._own_definitions(),
+                **dict.fromkeys(SINGLE_PACKETS, sweep[SWEEP]),
+                **sweep,
+                **standard_definitions(self._is_ros1),
+            },
+            packed=self._is_ros1,
+        )
 
     @property
     def topics(self) -> list[Topic]:
         """All topics by name. A topic with messages of two types is listed twice."""
         counts: dict[tuple[str, str], int] = {}
         for c in self._connections:
-            counts[c.topic, c.msgtype] = counts.get((c.topic, c.msgtype), 0) + c.msgcount
+            counts[c.topic, c.type] = counts.get((c.topic, c.type), 0) + c.n_messages
         return [Topic(*key, count) for key, count in sorted(counts.items())]
 
     @property
@@ -132,7 +123,7 @@ class BagReader:
 
         Messages with single packets of a lidar are put together to sweeps with the time of the first one.
         """
-        singles = {c.topic for c in self._connections if c.msgtype in SINGLE_PACKETS}
+        singles = {c.topic for c in self._connections if c.type in SINGLE_PACKETS}
         return (self._messages if singles.isdisjoint(topics) else self._sweeps)(topics, start)
 
     def _sweeps(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
@@ -142,7 +133,7 @@ class BagReader:
             if message.type not in SINGLE_PACKETS:
                 yield message
                 continue
-            key, data = (message.topic, message.type), packet_of(message.data, self._is_ros1)
+            key, data = (message.topic, message.type), packet_of(message.data, message.type, self._is_ros1)
             if is_lidar(data):
                 yield from self._sweep(*key, turns.setdefault(key, Sweeps()).add(message.time, data))
         for key, sweeps in turns.items():
@@ -156,14 +147,11 @@ class BagReader:
     def _messages(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
         """The messages as they are recorded."""
         chosen = [c for c in self._connections if c.topic in topics]
-        if not chosen:
-            return
-        with self._errors():
-            for connection, time, data in self._reader.messages(connections=chosen, start=start):
-                content = bytes(data)
-                if not self._is_ros1 and content.startswith(_ZSTD):  # CDR starts with a zero
-                    content = unpack_zstd(content)
-                yield RawMessage(connection.topic, connection.msgtype, time, content)
+        for connection, time, data in self._reader.messages(chosen, start):
+            if not self._is_ros1 and data.startswith(_ZSTD):  # CDR starts with a zero
+                with suppress(DataError):  # it is counted as one that cannot be decoded
+                    data = _unpacked(data, "zstd", MAX_CHUNK_BYTES - 1)
+            yield RawMessage(connection.topic, connection.type, time, data)
 
     def decode(self, message: RawMessage) -> dict[str, Any]:
         """The fields of a message. Raises `DataError`, which names the topic and the time of recording."""
@@ -176,11 +164,14 @@ class BagReader:
 
     @property
     def damage(self) -> str:
-        """What is missing in a damaged bag whose intact part is read; "" if nothing is."""
-        if not isinstance(self._reader, Salvage):
-            return getattr(self._reader, "damage", "")
+        """What is missing in a damaged bag; "" if nothing is."""
+        if isinstance(self._reader, CaptureMessages):
+            return self._reader.damage
         found, first = self._reader, self._reader.first
         n_stated, end = _stated(self.path)
+        unread = [*found.unread, *(name for name in _named(self.path) if not (self.path / name).is_file())]
+        if not found.is_damaged and not unread and found.n_messages >= n_stated:
+            return ""
         of_all = f" of {n_stated:,}" if n_stated else ""
         text = f"{found.n_messages:,}{of_all} messages in {(found.last - first) / 1e9:.1f} s are intact"
         if found.gaps:
@@ -189,79 +180,42 @@ class BagReader:
                 f"; {found.missing_seconds:.1f} s are missing, the longest gap from "
                 f"{(longest[0] - first) / 1e9:.1f} to {(longest[1] - first) / 1e9:.1f} s"
             )
-        if found.unread:
-            text += f"; nothing can be read of {', '.join(found.unread)}"
+        if unread:
+            text += f"; nothing can be read of {', '.join(unread)}"
         if end:
             missing = max(0, end - found.last) / NANOSECONDS
             return text + f"; {missing:.1f} s at the end are missing" * (missing >= _LEAST_MISSING)
         return text + "; the file is cut off there, and does not state how much is missing" * found.is_cut
 
-    def _salvaged(self) -> Salvage | CaptureMessages:
-        reader_class(self._is_ros1)  # puts limits on rosbags
-        if self.path.suffix in CAPTURES:
-            return CaptureMessages(self.path)
+    def _opened(self) -> BagFiles:
         try:
-            return Salvage(_files(self.path), _unpack_chunk, MAX_CHUNK_BYTES)
-        except DataError as error:
-            raise DamagedBagError(str(error)) from error
-
-    def _opened(self) -> Any:
-        """The opened reader of a capture, or that of rosbags: of the folder, or of its only file if
-        metadata.yaml is unusable."""
-        if self.path.suffix in CAPTURES:
-            capture = CaptureMessages(self.path)
-            if capture.damage:
-                raise DamagedBagError(f"{self.path} is damaged: {capture.damage}.")
-            return capture
-        for file in _files(self.path):
-            _check_length(file)
-        *tried, last = self.path, *_only_file(self.path)
-        for path in tried:
-            reader = reader_class(self._is_ros1)(_bounded(path))
-            with suppress(Exception):  # the parser of metadata.yaml raises many kinds
-                reader.open()
-                if reader.connections:
-                    return reader
-        reader = reader_class(self._is_ros1)(_bounded(last))
-        reader.open()
-        if tried:
-            _log.warning("%s/metadata.yaml is unusable; %s is read without it.", self.path, last.name)
-        return reader
+            files = _files(self.path)
+            if any(file.suffix == _PACKED for file in files):
+                self._unpacked_files = tempfile.TemporaryDirectory()
+                files = [_unpacked_file(file, Path(self._unpacked_files.name)) for file in files]
+            return BagFiles(files, _unpacked, MAX_CHUNK_BYTES)
+        except Exception as error:  # damaged bags raise many kinds
+            repair = _REPAIRS.get(self.path.suffix, "'ros2 bag reindex' writes metadata.yaml again")
+            raise DataError(
+                f"{self.path} cannot be read as a ROS bag: {str(error).removesuffix('.')}. It is truncated, "
+                f"damaged, or uses an unknown compression; {repair}."
+            ) from error
 
     def _own_definitions(self) -> dict[str, Any]:
         """Definitions in the bag. One that cannot be parsed is left out."""
         found: dict[str, Any] = {}
         for c in self._connections:
-            stated = c.msgdef if c.msgdef.data or c.msgtype not in _PACKETS else _known(c.msgtype)
-            if c.msgtype not in found and (parsed := parsed_definitions(stated, c.msgtype)):
+            stated = ("MSG", _known(c.type)) if c.type in _PACKETS and not c.definition else c[3:5]
+            if c.type not in found and (parsed := parsed_definitions(*stated, c.type)):
                 found.update(parsed)
         return found
 
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        """Turns every error of rosbags into a `DataError`; damaged bags raise many kinds of them."""
-        try:
-            yield
-        except GmmTorchError:
-            raise
-        except Exception as error:
-            reason = str(error) or type(error).__name__
-            if reason.endswith("interrupted"):
-                reason = "a query takes more steps than a file of this size needs"
-            if "index" in reason and self._is_ros1:
-                reason = f"{reason} (it was not closed)"
-            repair = _REPAIRS.get(self.path.suffix, "'ros2 bag reindex' writes metadata.yaml again")
-            raise DamagedBagError(
-                f"{self.path} cannot be read as a ROS bag: {reason}. It is truncated, damaged, or uses an "
-                f"unknown compression; {repair}."
-            ) from error
 
-
-def _known(message_type: str) -> SimpleNamespace:
+def _known(message_type: str) -> str:
     """The definition of a message with packets of a lidar."""
     package, (name, fields) = message_type.split("/")[0], _PACKETS[message_type]
     packet = f"{package}/{name}"
-    return definition(
+    return (
         f"std_msgs/Header header\n{packet}[] packets\n{'=' * 80}\nMSG: {packet}\n"
         f"builtin_interfaces/Time stamp\n{fields}\n"
     )
@@ -285,20 +239,26 @@ def _bag_file(path: Path) -> Path:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a bag: those of its folder, or the file itself."""
-    return [f for f in sorted(path.iterdir()) if f.suffix in _SUFFIXES] if path.is_dir() else [path]
+    """The files of a bag: those of its folder that metadata.yaml names, or all, or the file itself."""
+    if not path.is_dir():
+        return [path]
+    found = [f for f in sorted(path.iterdir()) if f.name.removesuffix(_PACKED).endswith(_SUFFIXES)]
+    named = _named(path)
+    return [f for f in found if f.name in named] or found
 
 
 def _metadata(path: Path) -> str:
-    """The text of metadata.yaml in a bag's folder; "" of a file."""
-    return (path / "metadata.yaml").read_text("utf-8", errors="replace") if path.is_dir() else ""
+    """The text of metadata.yaml in a bag's folder; "" without one."""
+    if not (path / "metadata.yaml").is_file():
+        return ""
+    with (path / "metadata.yaml").open(encoding="utf-8", errors="replace") as file:
+        return file.read(_MOST_METADATA)
 
 
-def _only_file(path: Path) -> list[Path]:
-    """The file of a bag's folder, if there is one and metadata.yaml names no other."""
-    files, text = _files(path), _metadata(path)
-    named = {name.split(": ")[-1].strip(" -") for name in re.findall(r"[^\n/,'\"[]+\.(?:mcap|db3)\b", text)}
-    return files if path.is_dir() and len(files) == 1 and named <= {files[0].name} else []
+def _named(path: Path) -> list[str]:
+    """The names of files in metadata.yaml."""
+    parts = {part.split(": ")[-1].strip(" -") for part in re.split(r"[\n/,'\"\[\]{}]", _metadata(path))}
+    return sorted(part for part in parts if part.removesuffix(_PACKED).endswith((".mcap", ".db3")))
 
 
 def _stated(path: Path) -> tuple[int, int]:
@@ -309,47 +269,7 @@ def _stated(path: Path) -> tuple[int, int]:
     return n_messages, begin + duration
 
 
-def _check_length(path: Path) -> None:
-    """Raise `EOFError` if a SQLite file is shorter than its header states.
-
-    Some versions of SQLite notice that only when they read a page that is missing.
-    """
-    with path.open("rb") as file:
-        header = file.read(100)
-    if not header.startswith(b"SQLite format 3\0") or header[24:28] != header[92:96]:
-        return  # another format, or a header without a valid number of pages
-    page = int.from_bytes(header[16:18], "big")
-    expected = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
-    if path.stat().st_size < expected:
-        raise EOFError(f"it has {path.stat().st_size:,} of {expected:,} bytes")
-
-
-class _BoundedFile(io.BufferedReader):
-    """A file that allocates no more for reading than it has left."""
-
-    def __init__(self, path: str) -> None:
-        raw = io.FileIO(path)
-        super().__init__(raw)
-        self._length = raw.seek(0, io.SEEK_END)
-        raw.seek(0)
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        if size is not None and size >= 0:
-            size = min(size, max(0, self._length - self.tell()))
-        return super().read(size)
-
-
-def _bounded(path: Path) -> Path:
-    """The path, whose files are opened as `_BoundedFile`."""
-
-    class BoundedPath(type(path)):  # type: ignore[misc]
-        def open(self, mode: str = "r", *args: Any, **options: Any) -> Any:
-            return _BoundedFile(str(self)) if mode == "rb" else super().open(mode, *args, **options)
-
-    return BoundedPath(path)
-
-
-# -- the package rosbags, with limits on what a hostile bag can make it allocate ---------------------
+# -- what a hostile bag can make its reader allocate -------------------------------------------------
 
 
 MAX_CHUNK_BYTES = 1 << 28
@@ -359,20 +279,6 @@ MAX_BAG_BYTES = 1 << 35
 """Limit of a ROS 2 bag file that is compressed as a whole, unpacked. It also takes at most half of the free
 space of the temporary folder."""
 
-_ZSTD_HEADER_BYTES = 18
-_MOST_BRACKETS = 50  # in one another, in YAML
-_MAGIC = {b"\x89MCAP0\r\n": ".mcap", b"SQLite f": ".db3"}
-
-
-def reader_class(is_ros1: bool) -> Any:
-    """The reader of ROS 1 or of ROS 2 bags, with limits. Raises `GmmTorchError` if rosbags does not load."""
-    with needs_extra("ROS bags and network captures need", "rosbags", "bags"):
-        import rosbags.rosbag1
-        import rosbags.rosbag2
-    ros1, ros2 = rosbags.rosbag1, rosbags.rosbag2
-    _limit_parsers(ros1.reader, ros2.reader, ros2.storage_mcap, ros2.metadata, ros2.storage_sqlite3)
-    return _limited_ros1_reader(ros1) if is_ros1 else _reader_by_magic(ros2)
-
 
 def standard_definitions(is_ros1: bool) -> dict[str, Any]:
     """The message types of ROS 1 Noetic or ROS 2 Jazzy."""
@@ -381,160 +287,53 @@ def standard_definitions(is_ros1: bool) -> dict[str, Any]:
     return dict(get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_JAZZY).fielddefs)
 
 
-def parsed_definitions(definition: Any, message_type: str) -> dict[str, Any]:
+def parsed_definitions(form: str, text: str, message_type: str) -> dict[str, Any]:
     """The types of a definition in a bag; empty if it is missing or cannot be parsed."""
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
     try:
-        if definition.format.name == "MSG":
-            return dict(get_types_from_msg(definition.data, message_type))
-        return dict(get_types_from_idl(definition.data)) if definition.format.name == "IDL" else {}
+        if form == "MSG":
+            return dict(get_types_from_msg(text, message_type))
+        return dict(get_types_from_idl(text)) if form == "IDL" else {}
     except Exception:  # the parser raises its own and many built-in errors
         return {}
 
 
-def unpack_zstd(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
-    """Unpack a compressed message or chunk. Raises `DataError` beyond `MAX_CHUNK_BYTES`."""
-    from rosbags.rosbag2 import storage_mcap
-
-    return _within(storage_mcap.zstd.ZstdDecompressor().decompress(data, _more(limit)))
-
-
-def _unpack_bz2(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
-    return _within(bz2.BZ2Decompressor().decompress(data, _more(limit)))
-
-
-def _unpack_lz4(data: bytes, limit: int = MAX_CHUNK_BYTES) -> bytes:
-    import lz4.frame
-
-    return _within(lz4.frame.LZ4FrameDecompressor().decompress(data, _more(limit)))
-
-
-def _unpack_chunk(data: bytes, compression: str, size: int) -> bytes:
-    """A chunk of a damaged bag, unpacked to at most a byte more than it announces."""
+def _unpacked(data: bytes, compression: str, size: int) -> bytes:
+    """A chunk or message, unpacked to at most a byte more than it announces. Raises `DataError`."""
     if compression in ("", "none"):
         return data
-    codecs = {"bz2": _unpack_bz2, "lz4": _unpack_lz4, "zstd": unpack_zstd}
-    if compression not in codecs:
-        raise DataError(f"the compression {compression!r} is not known")
+    limit = min(size, MAX_CHUNK_BYTES) + 1
     try:
-        return codecs[compression](data, size)
+        if compression == "bz2":
+            return bz2.BZ2Decompressor().decompress(data, limit)
+        if compression == "lz4":
+            import lz4.frame
+
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, limit))
+        if compression == "zstd":
+            from rosbags.rosbag2.storage_mcap import zstd
+
+            return bytes(zstd.ZstdDecompressor().decompress(data, limit))
     except Exception as error:  # each codec has errors of its own
         raise DataError(f"a chunk cannot be unpacked: {error}") from error
+    raise DataError(f"the compression {compression!r} is not known")
 
 
-def _more(limit: int) -> int:
-    return min(limit, MAX_CHUNK_BYTES) + 1
+def _unpacked_file(path: Path, folder: Path) -> Path:
+    """A file of a bag that is compressed as a whole, unpacked into a folder; another one as it is."""
+    from rosbags.rosbag2.storage_mcap import zstd
 
-
-def _within(unpacked: bytes) -> bytes:
-    if len(unpacked) > MAX_CHUNK_BYTES:
-        raise DataError(f"A compressed chunk unpacks to more than {MAX_CHUNK_BYTES:,} bytes; it is damaged.")
-    return unpacked
-
-
-def _limit_parsers(ros1: Any, ros2: Any, mcap: Any, metadata: Any, sqlite: Any) -> None:
-    """Put codecs and parsers with limits in the places where modules of rosbags look for theirs."""
-    if not isinstance(sqlite.apsw, SimpleNamespace):  # the package itself, not yet ours
-        sqlite.apsw = SimpleNamespace(**{**vars(sqlite.apsw), "Connection": _limited_database(sqlite.apsw)})
-    ros2.YAML = metadata.YAML = _plain_yaml
-    ros1.decompressors.update(bz2=_unpack_bz2, lz4=_unpack_lz4)
-    mcap.DECOMPRESSORS.update(lz4=_unpack_lz4, zstd=unpack_zstd)
-    ros2.zstd = SimpleNamespace(open=_limited_zstd_file(mcap.zstd), decompress=unpack_zstd)
-
-
-def _plain_yaml(**options: Any) -> Any:
-    """A parser of YAML that refuses aliases, with which a few lines become billions of entries, and brackets
-    in brackets in brackets, each of which takes longer than the one around it."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-    from ruamel.yaml.events import AliasEvent
-
-    class PlainYaml(YAML):
-        def load(self, stream: Any) -> Any:
-            if "*" in stream and any(isinstance(one, AliasEvent) for one in YAML(**options).parse(stream)):
-                raise YAMLError("aliases are not read")
-            brackets = ((1 if found in "[{" else -1) for found in re.findall(r"[\[\]{}]", stream))
-            if max(itertools.accumulate(brackets), default=0) > _MOST_BRACKETS:
-                raise YAMLError("its brackets are nested too deeply")
-            return super().load(stream)
-
-    return PlainYaml(**options)
-
-
-def _limited_database(apsw: Any) -> Any:
-    class LimitedDatabase(apsw.Connection):
-        """A database whose queries end, whatever views and generated columns it has."""
-
-        def __init__(self, filename: str, *args: Any, **options: Any) -> None:
-            super().__init__(filename, *args, **options)
-            path = Path(filename.removeprefix("file:").removesuffix("?immutable=1"))
-            steps = QuerySteps(path.stat().st_size)
-            self.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
-            self.set_exec_trace(lambda *_: steps.begin())
-            self.set_progress_handler(steps.is_over, QuerySteps.EACH_CALL)
-
-    return LimitedDatabase
-
-
-def _limited_zstd_file(zstd: Any) -> Any:
-    class LimitedZstdFile(zstd.ZstdFile):
-        """A compressed file that is not read further than `_most_bag_bytes`."""
-
-        def __init__(self, packed: BinaryIO, mode: str = "rb") -> None:
-            announced = zstd.get_frame_info(packed.read(_ZSTD_HEADER_BYTES)).decompressed_size
-            packed.seek(0)
-            self._left = _most_bag_bytes()
-            _check_bag(self._left - (announced or 0))
-            super().__init__(packed, mode)
-
-        def read(self, size: int | None = -1) -> bytes:
-            found: bytes = super().read(size)
-            self._left -= len(found)
-            _check_bag(self._left)
-            return found
-
-    return LimitedZstdFile
-
-
-def _most_bag_bytes() -> int:
-    return min(MAX_BAG_BYTES, shutil.disk_usage(tempfile.gettempdir()).free // 2)
-
-
-def _check_bag(bytes_left: int) -> None:
-    if bytes_left < 0:
-        raise DataError(
-            f"The compressed bag unpacks to more than {MAX_BAG_BYTES:,} bytes, or to more than half of the "
-            f"free space of {tempfile.gettempdir()}. If you trust it, unpack its files with 'zstd -d', "
-            "and write its metadata.yaml again with 'ros2 bag reindex'."
-        )
-
-
-def _reader_by_magic(rosbag2: Any) -> Any:
-    class ReaderByMagic(rosbag2.Reader):
-        """Knows the storage of a file by its first bytes, whatever its name."""
-
-        def __init__(self, path: Any) -> None:
-            super().__init__(path)
-            if not path.is_dir():
-                with path.open("rb") as file:
-                    suffix = _MAGIC.get(file.read(8), path.suffix)
-                self.storage = self.STORAGE_PLUGINS[suffix](path)
-
-    return ReaderByMagic
-
-
-def _limited_ros1_reader(rosbag1: Any) -> Any:
-    class LimitedRos1Reader(rosbag1.Reader):
-        """Reads each byte of the index once: chunks that share an index would multiply it."""
-
-        _index_bytes = 0
-
-        def read_index_data(self, pos: int, indexes: Any) -> None:
-            before = self.bio.tell()
-            super().read_index_data(pos, indexes)
-            self._index_bytes += self.bio.tell() - before
-            if self._index_bytes > self.path.stat().st_size:
-                raise rosbag1.ReaderError("Bag index looks damaged: its parts overlap.")
-
-    return LimitedRos1Reader
+    if path.suffix != _PACKED:
+        return path
+    left = min(MAX_BAG_BYTES, shutil.disk_usage(folder).free // 2)
+    with zstd.open(path, "rb") as packed, (folder / path.stem).open("wb") as file:
+        while block := packed.read(_BLOCK_BYTES):
+            left -= file.write(block)
+            if left < 0:
+                raise DataError(
+                    f"the compressed bag unpacks to more than {MAX_BAG_BYTES:,} bytes, or to more than half "
+                    f"of the free space of {folder}. If you trust it, unpack its files with 'zstd -d', and "
+                    "write its metadata.yaml again with 'ros2 bag reindex'"
+                )
+    return folder / path.stem

@@ -173,18 +173,14 @@ def _camera(reader: BagReader, topic: Topic) -> Sensor | None:
     return Sensor(topic, COMPRESSED) if "compressedDepth" in message["format"] else None
 
 
-def choose_camera_info(reader: BagReader, image: str, wanted: str | None) -> str:
-    """The topic of the camera parameters: `wanted`, or the one that shares most of the image topic's name."""
+def choose_camera_info(reader: BagReader, image: str) -> str:
+    """The topic of the camera parameters: the one that shares most of the image topic's name."""
     infos = [topic.name for topic in reader.topics if topic.type == INFO_TYPE and topic.n_messages]
-    if wanted in infos:
-        return wanted
     best = nearest_names(infos, image)
-    if wanted is not None or len(best) != 1:
-        choice = f"Choose one: ‹camera_info›={best[0]}, or state" if best else "State"
+    if len(best) != 1:
         raise InvalidArgumentError(
-            f"{reader.path}: ‹camera_info›={wanted} is not clear for the images of {image}; topics of "
-            f"type CameraInfo are {', '.join(infos) or 'none'}. {choice} ‹intrinsics›=[fx,fy,cx,cy] in "
-            "pixels, without distortion."
+            f"{reader.path}: the camera of the images of {image} is not clear; topics of type CameraInfo are "
+            f"{', '.join(infos) or 'none'}. State ‹intrinsics›=[fx,fy,cx,cy] in pixels, without distortion."
         )
     return best[0]
 
@@ -206,22 +202,15 @@ def stated_unit(reader: BagReader, image: str) -> float | None:
     return unit
 
 
-def choose_imu(reader: BagReader, wanted: str | None) -> str:
-    """The topic `wanted`, or else the only one of an IMU. Raises `InvalidArgumentError`, which lists them."""
+def choose_imu(reader: BagReader) -> str:
+    """The topic of an IMU with most messages: every one that TF connects with the sensor has its turns."""
     found = [topic for topic in reader.topics if topic.type == IMU_TYPE and topic.n_messages]
-    if wanted is None and len(found) > 1:
+    if not found:
         raise InvalidArgumentError(
-            f"{reader.path} has {len(found)} topics of an IMU: {listed(found)}. Choose one: "
-            f"‹imu_topic›={found[0].name}."
+            f"motion=imu cannot be used: {reader.path} has no topic of type sensor_msgs/Imu with messages. "
+            "Record one, or predict with ‹motion›=constant or ‹motion›=dataset."
         )
-    chosen = [topic.name for topic in found if wanted in (None, topic.name)]
-    if not chosen:
-        what = "has no topic" if wanted is None else f"has no topic ‹imu_topic›={wanted}"
-        raise InvalidArgumentError(
-            f"motion=imu cannot be used: {reader.path} {what} of type sensor_msgs/Imu with messages, only "
-            f"{listed(found)}. Record one, or predict with ‹motion›=constant or ‹motion›=dataset."
-        )
-    return chosen[0]
+    return max(found, key=lambda topic: topic.n_messages).name
 
 
 def nearest_names(names: list[str], topic: str) -> list[str]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from gmmtorch.datasets.base import NO_POSE, Dataset, Ranges, require_path
 from gmmtorch.datasets.packets.lidar_packets import LidarPackets
 from gmmtorch.datasets.point_files.channels import check_channels
 from gmmtorch.datasets.ros.bag_poses import BagSurvey, Record, RegisteredPoses, TfPoses
-from gmmtorch.datasets.ros.bag_reader import BagReader, DamagedBagError, RawMessage
+from gmmtorch.datasets.ros.bag_reader import BagReader, RawMessage
 from gmmtorch.datasets.ros.bag_topics import (
     IMU_TYPE,
     Sensor,
@@ -39,7 +39,6 @@ from gmmtorch.scan import FARTHEST, Scan
 
 HEADER = "std_msgs/msg/Header"
 _SHORT_SKIP = 16
-T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
@@ -55,12 +54,9 @@ def open_rosbag(
     max_gap: float = 2.0,
     clock: str = "header",
     deskew: bool = True,
-    camera_info: str | None = None,
     pixel_stride: int = 1,
     depth_scale: float | None = None,
     intrinsics: list[float] | None = None,
-    imu_topic: str | None = None,
-    damaged: str = "read",
     calibration: str | None = None,
     attributes: Iterable[str] = (),
 ) -> Dataset:
@@ -77,13 +73,11 @@ def open_rosbag(
         max_gap: longest time (s) between two poses that are interpolated.
         clock: "header", the stamps of the messages, or "received", the times of recording.
         deskew: whether points with times get the pose of their own time.
-        camera_info: topic of the camera parameters of depth images.
         pixel_stride: every n-th pixel of every n-th row of depth images is used.
         depth_scale: metres per unit of depth images; None: as a RealSense's bag states, otherwise
             0.001 for whole numbers, 1 for floating ones.
-        intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of `camera_info`.
-        imu_topic: of the IMU of `RosBag.turns`; None: the only one.
-        damaged: "read" reads the intact part of a damaged bag; "refuse" raises an error.
+        intrinsics: fx, fy, cx, cy in pixels of depth images without distortion; None: of the
+            CameraInfo topic that is nearest by name.
         calibration: file of the lidar whose packets are read, see `LidarPackets`.
         attributes: channels of points that are read, such as "intensity" and "colour".
     """
@@ -93,24 +87,20 @@ def open_rosbag(
     check_choice("clock", clock, ("header", "received"))
     if not max_gap > 0:
         raise InvalidArgumentError(f"‹max_gap›={max_gap} must be a time above zero seconds.")
-    check_choice("damaged", damaged, ("read", "refuse"))
 
     topics = [topic] if topic is None or isinstance(topic, str) else list(dict.fromkeys(map(str, topic)))
     if not topics:
         raise InvalidArgumentError("‹topic›=[] names no topic; leave it out to read the only sensor.")
 
-    def opened(is_salvaged: bool) -> Dataset:
-        readers = [BagReader(file, is_salvaged) for _ in topics]  # each reads on where its sensor is
-        if damage := readers[0].damage:
-            _log.warning("%s is damaged: %s. damaged=refuse makes this an error.", file, damage)
-        bags = [opened_sensor(reader, name) for reader, name in zip(readers, topics, strict=True)]
-        return bags[0] if len(bags) == 1 else SeveralSensors(bags)
+    reader = BagReader(file)
+    if damage := reader.damage:
+        _log.warning("%s is damaged: %s.", file, damage)
 
-    def opened_sensor(reader: BagReader, name: str | None) -> RosBag:
+    def opened(name: str | None) -> RosBag:
         sensor = choose_sensor(reader, name)
         info = None
         if sensor.is_camera and intrinsics is None:
-            info = choose_camera_info(reader, sensor.topic.name, camera_info)
+            info = choose_camera_info(reader, sensor.topic.name)
         survey = BagSurvey(reader, sensor, info, poses, frame, extrinsic, max_gap)
         if len(topics) > 1 and not survey.places_sensor:
             raise InvalidArgumentError(
@@ -121,28 +111,13 @@ def open_rosbag(
         unit = stated_unit(reader, sensor.topic.name) if depth_scale is None else depth_scale
         camera = ImageCamera(sensor, survey.camera_info(), pixel_stride, unit, intrinsics)
         packets = LidarPackets(calibration, reader)
-        options = sensor_frame, clock, deskew, imu_topic, check_channels(attributes), packets
+        options = sensor_frame, clock, deskew, check_channels(attributes), packets
         if sensor.is_camera:
             return DepthBag(reader, sensor, survey, ranges, stride, *options, camera)
         return RosBag(reader, sensor, survey, ranges, stride, *options)
 
-    return whole_or_intact(opened, damaged == "read")
-
-
-def whole_or_intact(read: Callable[[bool], T], may_salvage: bool = True) -> T:
-    """What a function reads of a whole bag (False), or else of the intact part of a damaged one (True).
-
-    Raises `DamagedBagError` if the bag is damaged, and no part of it is intact or may be read.
-    """
-    try:
-        return read(False)
-    except DamagedBagError as error:
-        try:
-            if may_salvage:
-                return read(True)
-        except DamagedBagError:
-            pass
-        raise error
+    bags = [opened(name) for name in topics]
+    return bags[0] if len(bags) == 1 else SeveralSensors(bags)
 
 
 class RosBag(Dataset):
@@ -166,14 +141,13 @@ class RosBag(Dataset):
         sensor_frame: str | None,
         clock: str,
         deskew: bool,
-        imu_topic: str | None,
         attributes: tuple[str, ...],
         packets: LidarPackets,
         camera: ImageCamera | None = None,
     ) -> None:
         super().__init__(reader.path.stem, ranges, stride)
         self._reader, self._camera, self._clock = reader, camera, clock
-        self._imu_topic, self._tree, self._max_gap = imu_topic, survey.tree, survey.max_gap
+        self._tree, self._max_gap = survey.tree, survey.max_gap
         self.topic = sensor.topic.name
         self._where = f"{reader.path}, topic {self.topic}"
         self._stream: Iterator[RawMessage] | None = None
@@ -267,7 +241,7 @@ class RosBag(Dataset):
         NaN, and a warning states how many. Raises `InvalidArgumentError`, with the remedy, if all are.
         """
         records, poses = self._records[:: self.stride], self._in_space[:: self.stride]
-        gyroscope = read_gyroscope(self._reader, self._imu_topic, self._clock)
+        gyroscope = read_gyroscope(self._reader, self._clock)
         stamps = np.array([record.stamp for record in records])
         source = self._source
         frames = [source.sensor if isinstance(source, RegisteredPoses) else r.frame for r in records]
@@ -456,13 +430,13 @@ def _products(turns: Tensor) -> Tensor:
     return found
 
 
-def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscope:
-    """The angular velocities of a bag's IMU; topic and clock are those of `open_rosbag`.
+def read_gyroscope(reader: BagReader, clock: str) -> Gyroscope:
+    """The angular velocities of a bag's IMU; the clock is that of `open_rosbag`.
 
     Messages that cannot be decoded or that state no usable rate are left out. If the clock jumps, the longest
     series of messages in order is used. Raises `InvalidArgumentError`, with the remedy.
     """
-    name = choose_imu(reader, topic)
+    name = choose_imu(reader)
     where = f"{reader.path}, topic {name}"
     times, rates = array("q"), array("d")
     frames: Counter[str] = Counter()
@@ -491,7 +465,7 @@ def read_gyroscope(reader: BagReader, topic: str | None, clock: str) -> Gyroscop
         raise _unusable(
             f"{where} has {len(kept)} usable angular velocities in {faults.total() + len(times)} messages "
             f"({reasons})",
-            "Choose another ‹imu_topic›",
+            "Record another IMU",
         )
     if len(frames) > 1:
         counts = ", ".join(f"{frame or '(unnamed)'} ({n} messages)" for frame, n in frames.most_common(5))
@@ -506,11 +480,8 @@ def sensor_turns(
     """Rotations (M, 3, 3) of a sensor since the scan before, before ← now; the first is the identity.
 
     Where the rotation of the IMU or of its mounting is unknown, they are NaN, and a warning states how many.
-
-    Args:
-        gyroscope: of the IMU. tree: TF, with the mounting of both.
-        frames: of the sensor at each scan (M). stamps: of the scans (M,), ns, in order.
-        max_gap: longest time (s) between two transforms that are interpolated, if the mounting moves.
+    frames: of the sensor at each scan (M). stamps: of the scans (M,), ns, in order. max_gap: longest time (s)
+    between two transforms that are interpolated, if the mounting moves.
 
     Raises `InvalidArgumentError` if TF does not connect the frames, or if no rotation is known.
     """

@@ -1,4 +1,5 @@
-"""The intact part of a damaged ROS bag: chunks that are whole, or rows of a database, wherever they are.
+"""The messages of a ROS bag, and of a damaged one the intact part: chunks that are whole, or rows of a
+database, wherever they are.
 
 A ROS 1 bag and an MCAP file are sequences of records, most of them chunks of messages. After a damaged record
 the next chunk is searched by its header. The index of a file is not needed, so a recording may be cut off.
@@ -12,7 +13,6 @@ import struct
 import zlib
 from abc import ABC, abstractmethod
 from array import array
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -46,30 +46,42 @@ class _Place(NamedTuple):
     crc: int = 0
 
 
-class Salvage:
-    """The messages that a damaged bag still has, in the order of recording.
+class Connection(NamedTuple):
+    """A topic of a recording: the type of its messages, and their definition in the form MSG or IDL."""
+
+    id: int
+    topic: str
+    type: str
+    form: str = ""
+    definition: str = ""
+    n_messages: int = 0
+
+
+class BagFiles:
+    """The messages of a bag, or those that a damaged one still has, in the order of recording.
 
     Args:
         files: .bag, .mcap or .db3 files of one recording.
         unpack: unpacks a chunk within limits. limit: bytes of a chunk or message, at most.
 
     Attributes:
-        connections: as those of a reader of rosbags.
+        connections: topics, once for each file and type.
         n_messages: that can be read.
         gaps: (first, last) time (ns) of each interval between intact messages whose messages are lost.
         first, last: times (ns) of the first and the last one.
+        is_damaged: whether a part of a file is not intact.
         is_cut: whether a file ends before its end, so that later messages may be missing, too.
         unread: names of files, one of several, of which nothing can be read.
 
-    Raises `DataError` if no message can be read.
+    Raises `DataError` if a damaged bag has no message that can be read.
     """
 
     def __init__(self, files: Collection[Path], unpack: Unpack, limit: int) -> None:
         self._unpack, self._limit = unpack, limit
         self._sources: list[_Chunked | _Database] = []
-        self.connections: list[Any] = []
+        self.connections: list[Connection] = []
         self.gaps: list[tuple[int, int]] = []
-        self.is_cut = False
+        self.is_damaged = self.is_cut = False
         self.unread: list[str] = []
         parts = [np.empty((0, 5), np.int64)]
         for file in files:
@@ -79,17 +91,27 @@ class Salvage:
                 if len(files) == 1:
                     raise
                 self.unread.append(file.name)
+                self.is_damaged = True
         rows = np.concatenate(parts)
         self.n_messages = len(rows)
-        if not self.n_messages:
-            raise DataError(f"{', '.join(map(str, files))}: no message can be read.")
+        if self.is_damaged and not self.n_messages:
+            faults = dict.fromkeys(source.fault for source in self._sources if source.fault)
+            raise DataError(": ".join(["no message can be read", *faults]))
         self._rows = rows[np.argsort(rows[:, 0], kind="stable")]
-        self.first, self.last = (int(time) for time in self._rows[[0, -1], 0])
+        self.first, self.last = (int(time) for time in self._rows[[0, -1], 0]) if len(rows) else (0, 0)
 
     def _added(self, file: Path) -> np.ndarray:
         """Times, sources, connections, and two numbers (N, 5) of the messages of a file."""
-        kinds: dict[str, type[_Chunked | _Database]] = {".bag": _Ros1Bag, ".mcap": _Mcap, ".db3": _Database}
-        source = kinds[file.suffix](file, self._unpack, self._limit)
+        kinds: dict[str | bytes, type[_Chunked | _Database]] = {
+            ".bag": _Ros1Bag,
+            ".mcap": _Mcap,
+            ".db3": _Database,
+            _MCAP_MAGIC: _Mcap,
+            _SQLITE_MAGIC: _Database,
+        }
+        with file.open("rb") as opened:  # a file may have another name than its content
+            kind = kinds.get(opened.read(len(_MCAP_MAGIC))) or kinds[file.suffix]
+        source = kind(file, self._unpack, self._limit)
         self._sources.append(source)
         found, last, is_after_loss = array("q"), None, False
         for messages, is_whole in source.parts():
@@ -99,17 +121,21 @@ class Salvage:
                     self.gaps.append((last, begin))
                 last, is_after_loss = max(last or 0, end), False
             is_after_loss |= not is_whole
+            self.is_damaged |= not is_whole
             for message in messages:
                 found.extend(message)
         self.is_cut |= is_after_loss
         rows = np.array(found, np.int64).reshape(-1, 4)
-        counts, numbers = Counter(rows[:, 1].tolist()), dict[int, int]()
+        keys, place, counts = np.unique(rows[:, 1], return_inverse=True, return_counts=True)
+        n_messages = dict(zip(keys.tolist(), counts.tolist(), strict=True))
+        numbers = dict[int, int]()
         for key, connection in source.connections().items():
             numbers[key] = len(self.connections)
-            self.connections.append(connection._replace(id=numbers[key], msgcount=counts[key]))
-        rows = rows[np.isin(rows[:, 1], list(numbers))]
-        ids = np.array([numbers[key] for key in rows[:, 1].tolist()], np.int64)
-        return np.column_stack([rows[:, 0], np.full_like(ids, len(self._sources) - 1), ids, rows[:, 2:]])
+            one = connection._replace(id=numbers[key], n_messages=n_messages.get(key, 0))
+            self.connections.append(one)
+        ids = np.array([numbers.get(key, -1) for key in keys.tolist()], np.int64)[place]
+        of = np.full_like(ids, len(self._sources) - 1)
+        return np.column_stack([rows[:, 0], of, ids, rows[:, 2:]])[ids >= 0]
 
     @property
     def missing_seconds(self) -> float:
@@ -117,8 +143,8 @@ class Salvage:
         return sum(end - begin for begin, end in self.gaps) / NANOSECONDS
 
     def messages(
-        self, connections: Collection[Any], start: int | None = None
-    ) -> Iterator[tuple[Any, int, bytes]]:
+        self, connections: Collection[Connection], start: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
         """(connection, time in ns, content) of messages of some connections, from a time on."""
         wanted = np.isin(self._rows[:, 2], [connection.id for connection in connections])
         if start is not None:
@@ -130,18 +156,9 @@ class Salvage:
                 yield self.connections[connection], time, data
 
 
-def _connection(topic: str, kind: str, form: str, definition: str) -> Any:
-    from rosbags.interfaces import (
-        Connection,
-        ConnectionExtRosbag2,
-        MessageDefinition,
-        MessageDefinitionFormat,
-    )
-
+def _connection(topic: str, kind: str, form: str, definition: str) -> Connection:
     package, _, name = kind.rpartition("/")
-    kind = kind if "/msg/" in kind else f"{package}/msg/{name}"
-    text = MessageDefinition(MessageDefinitionFormat[form], definition)
-    return Connection(0, topic, kind, text, "", 0, ConnectionExtRosbag2("cdr", []), None)
+    return Connection(0, topic, kind if "/msg/" in kind else f"{package}/msg/{name}", form, definition)
 
 
 _ERRORS = (DataError, ValueError, KeyError, IndexError, struct.error, OverflowError, OSError, RuntimeError)
@@ -149,7 +166,7 @@ _ERRORS = (DataError, ValueError, KeyError, IndexError, struct.error, OverflowEr
 
 
 class _Chunked(ABC):
-    """A file of records."""
+    """A file of records. fault: the first damage that is found in it."""
 
     def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
         self._unpack, self._limit = unpack, limit
@@ -160,9 +177,10 @@ class _Chunked(ABC):
         with path.open("rb") as file:
             self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._kept: dict[int, bytes] = {}
-        self._connections: dict[int, Any] = {}
+        self._connections: dict[int, Connection] = {}
+        self.fault = ""
 
-    def connections(self) -> dict[int, Any]:
+    def connections(self) -> dict[int, Connection]:
         """The connections by the numbers that messages have."""
         return self._connections
 
@@ -173,7 +191,8 @@ class _Chunked(ABC):
         while at is not None and at < len(self._data):
             try:
                 following, found, is_whole = self._record(at)
-            except _ERRORS:
+            except _ERRORS as error:
+                self.fault = self.fault or str(error)
                 following, found, is_whole = self._next(at + 1), self._cut_off(at), False
             yield found, is_whole
             at = following
@@ -375,12 +394,12 @@ class _Mcap(_Chunked):
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._channels: dict[int, tuple[int, str]] = {}
 
-    def connections(self) -> dict[int, Any]:
+    def connections(self) -> dict[int, Connection]:
         found = {}
         for key, (schema, topic) in self._channels.items():
             if schema in self._schemas:
                 kind, encoding, text = self._schemas[schema]
-                found[key] = _connection(topic, kind, _MCAP_FORMS.get(encoding, "NONE"), text)
+                found[key] = _connection(topic, kind, _MCAP_FORMS.get(encoding, ""), text)
         return found
 
     def _first(self) -> int:
@@ -462,37 +481,17 @@ def _mcap_text(content: bytes, at: int) -> tuple[str, int]:
 # -- SQLite ------------------------------------------------------------------------------------------
 
 
+_SQLITE_MAGIC = b"SQLite f"
 _MOST_LOST_ROWS = 1 << 40
-_LEAST_STEPS, _STEPS_EACH_BYTE = 20_000_000, 1000  # of a query
+_STEPS_EACH_CALL = 10_000  # steps of SQLite's virtual machine between two calls that count them
+_LEAST_CALLS, _BYTES_EACH_CALL = 2000, 10  # of a query, which takes a number of steps by the file's size
 _NEXT_ROW = "SELECT rowid, timestamp, topic_id FROM messages WHERE rowid > ? ORDER BY rowid LIMIT 1"
-
-
-class QuerySteps:
-    """Counts the steps of SQLite's virtual machine, of which a query of a file has a number by its size.
-
-    A view or a generated column of a hostile file could take steps without end.
-    """
-
-    EACH_CALL = 10_000
-    """Steps between two calls of `is_over`."""
-
-    def __init__(self, n_bytes: int) -> None:
-        self._most = (_LEAST_STEPS + _STEPS_EACH_BYTE * n_bytes) // self.EACH_CALL
-        self._n = 0
-
-    def begin(self) -> bool:
-        """A query begins. Returns True, which lets it run."""
-        self._n = 0
-        return True
-
-    def is_over(self) -> bool:
-        """Whether the query has taken too many steps, which ends it."""
-        self._n += 1
-        return self._n > self._most
 
 
 class _Database:
     """A database of ROS 2, whose rows are read one after the other; rows in damaged pages are passed over."""
+
+    fault = ""
 
     def __init__(self, path: Path, unpack: Unpack, limit: int) -> None:
         import sqlite3
@@ -501,9 +500,9 @@ class _Database:
         self._database = sqlite3.connect(f"{path.resolve().as_uri()}?immutable=1", uri=True)
         self._database.text_factory = lambda data: data.decode(errors="replace")
         self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
-        steps = QuerySteps(path.stat().st_size)
-        self._database.set_trace_callback(lambda query: steps.begin() and None)
-        self._database.set_progress_handler(steps.is_over, QuerySteps.EACH_CALL)
+        self._n_calls, self._most_calls = 0, _LEAST_CALLS + path.stat().st_size // _BYTES_EACH_CALL
+        self._database.set_trace_callback(self._begin)
+        self._database.set_progress_handler(self._is_over, _STEPS_EACH_CALL)
         self._database.execute("PRAGMA trusted_schema=OFF")
         self._database.execute("PRAGMA writable_schema=ON")  # opens a file that is shorter than it states
         query = "SELECT count(*) FROM sqlite_master WHERE type='table' AND name IN ('messages', 'topics')"
@@ -512,19 +511,26 @@ class _Database:
                 return
         raise DataError("it has no readable tables of messages and topics")
 
-    def connections(self) -> dict[int, Any]:
+    def _begin(self, query: str) -> None:
+        self._n_calls = 0
+
+    def _is_over(self) -> bool:
+        """Whether a query has taken too many steps: a view of a hostile file could take them without end."""
+        self._n_calls += 1
+        return self._n_calls > self._most_calls
+
+    def connections(self) -> dict[int, Connection]:
         """The topics by their numbers."""
         texts: dict[str, tuple[str, str]] = {}
         with suppress(self._error):  # older recordings have no definitions
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             texts = {
-                kind: (_MCAP_FORMS.get(form, "NONE"), text)
-                for kind, form, text in self._database.execute(query)
+                kind: (_MCAP_FORMS.get(form, ""), text) for kind, form, text in self._database.execute(query)
             }
         found = {}
         for key, topic, kind in self._database.execute("SELECT id, name, type FROM topics"):
             if isinstance(topic, str) and isinstance(kind, str):
-                found[key] = _connection(topic, kind, *texts.get(kind, ("NONE", "")))
+                found[key] = _connection(topic, kind, *texts.get(kind, ("", "")))
         return found
 
     def parts(self) -> Iterator[tuple[list[_Found], bool]]:
