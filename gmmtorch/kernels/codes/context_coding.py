@@ -75,5 +75,5 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writ
     scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)
     values = list(vars(batch).values())[1:-1]  # without side and cells
     kernel = _CODINGS[batch.dim, writes]
-    kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result, device=result.device)
+    kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result)
     return int(result)

@@ -27,5 +27,5 @@ def number_coding(
     sizes = (len(rows), rows.shape[1], width)
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (rows, power, len(power) // 2, level, height, *slots)
-    _CODINGS[writes](1, *sizes, *scratch, stream, len(stream), 0, result, device=result.device)
+    _CODINGS[writes](1, *sizes, *scratch, stream, len(stream), 0, result)
     return int(result)

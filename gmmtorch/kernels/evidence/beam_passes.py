@@ -59,9 +59,8 @@ def beam_passes(
         return _batched(whitening, offsets, deviations[:, 0], (directions, lengths, is_hit), limits)
     k, dim = offsets.shape
     passed, returned = (offsets.new_empty(k) for _ in range(2))
-    rows = [part.contiguous() for part in given]
     numbers = limits._replace(through=limits.through**2)
-    _KERNELS[dim](k, *rows, len(beams), *numbers, passed, returned, device=offsets.device)
+    _KERNELS[dim](k, *given, len(beams), *numbers, passed, returned)
     return passed, returned
 
 

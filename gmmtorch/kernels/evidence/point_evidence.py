@@ -61,19 +61,8 @@ def listed_evidence(
         rows: see `PointTable.rows`.
     """
     lanes = CPU_LANES if points.device.type == "cpu" else 1
-    _EVIDENCE[points.shape[1]](
-        (order.shape[0] + lanes - 1) // lanes,
-        points.contiguous(),
-        order,
-        bucket,
-        order.shape[0],
-        *lists,
-        rows,
-        resolution,
-        cutoff,
-        *found,
-        device=points.device,
-    )
+    given = points, order, bucket, len(order), *lists, rows
+    _EVIDENCE[points.shape[1]](-(-len(order) // lanes), *given, resolution, cutoff, *found)
 
 
 def pair_evidence(
@@ -174,10 +163,10 @@ def few_points_evidence(
     """
     n, dim = points.shape
     device = points.device
-    means, covariances, max_range, origins, by, seen_from, count = (value.contiguous() for value in views)
-    counts, points = torch.empty_like(by), points.contiguous()
+    means, covariances, max_range, origins, by, seen_from, count = views
+    counts = torch.empty_like(by)
     tested = means, covariances, origins, by, seen_from, points, n, widest, cutoff
-    _NEAR_FEW[dim](len(by), *tested, counts, device=device)
+    _NEAR_FEW[dim](len(by), *tested, counts)
     found = points.new_zeros(len(sides), 2, n)
     lengths = torch.tensor(list(sides), dtype=torch.float64).to(device, non_blocking=True)
     parts = 1 if device.type == "cpu" else n
@@ -185,7 +174,7 @@ def few_points_evidence(
         each = points.new_empty(len(chosen), *found.shape)
         given = means, covariances, max_range, origins, by, seen_from, count, points, n
         rows = chosen, *given, lengths, len(sides), cutoff, parts, each
-        _OF_FEW[dim](len(chosen) * parts, *rows, device=device)
+        _OF_FEW[dim](len(chosen) * parts, *rows)
         found += each.sum(0)
     return found, counts.sum()
 
@@ -241,10 +230,10 @@ def near_lists(
         firsts, counts = ends - lengths, torch.zeros_like(lengths, dtype=torch.float64)
         near = torch.empty(int(ends[-1]) if len(ends) else 0, dtype=torch.bool, device=table.device)
         lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
-        arguments = (table, *given, lists, firsts, centers.contiguous(), radii.contiguous(), len(lists))
+        arguments = (table, *given, lists, firsts, centers, radii, len(lists))
         sizes = (cube_reach, spread, table.shape[1], cutoff, parts)
         n_items = (len(lists) + lanes - 1) // lanes * parts
-        _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts, device=table.device)
+        _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts)
         counts = counts.long()
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])

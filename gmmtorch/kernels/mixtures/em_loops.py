@@ -102,7 +102,7 @@ def fused_exact_em(
         features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED, MERGED
     )
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
-    rows = features.contiguous(), weight.contiguous(), n, k, padded, n_parts
+    rows = features, weight, n, k, padded, n_parts
     limits = reg_covar, tol, last_bound, n_iter, guarded
     made = mixtures, masses, natural, table if lists else None, *others
     _launch(_EXACT[dim, wide], team, head, (*rows, *limits), made)
@@ -180,7 +180,7 @@ def fused_truncated_em(
     )
     natural, statistics, flags, owners, groups = (others[i] for i in (1, 2, 8, 9, 12))
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
-    rows = values.contiguous(), weight.contiguous(), owner.contiguous(), first
+    rows = values, weight, owner, first
     given = *rows, n, columns == dim, k, m, n_samples, n_parts, *limits, n_bounds
     bounds: list[float] = []
     while True:
@@ -232,7 +232,7 @@ def _launch(
         n_phases = 1 if is_stepped else 1 << 62
         if team.arrived is not None:
             team.arrived.zero_()
-        kernel(team.n, *team, *given, n_phases, before, after, bounds, *tables, device=head.device)
+        kernel(team.n, *team, *given, n_phases, before, after, bounds, *tables)
         if not is_stepped or after[2]:
             return
         before.copy_(after)

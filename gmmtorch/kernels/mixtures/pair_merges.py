@@ -45,8 +45,8 @@ def pair_merges(
     not positive definite, or its determinant is beyond 10^±280.
     """
     k, dim = means.shape
-    given = order, weights.contiguous(), means.contiguous(), covariances.contiguous()
-    made = torch.empty_like(given[1]), torch.empty_like(given[2]), torch.empty_like(given[3])
+    given = weights, means, covariances
+    made = weights.new_empty(k), weights.new_empty(k, dim), weights.new_empty(k, dim, dim)
     members, lead = torch.empty_like(order), torch.empty_like(order)
     block = 8 * max(4, math.isqrt(k) // 8)  # about as many blocks as rows in each
     scratch = weights.new_empty((k + 2 * block) * (3 + 3 * dim + dim**2 + 2 * neighbors))
@@ -56,7 +56,6 @@ def pair_merges(
     team = Team.of(order.device)
     rule = least, limit, is_hellinger, neighbors, block
     _MERGES[dim](
-        team.n, *team, k, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
-        device=order.device,
+        team.n, *team, k, order, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
     )  # fmt: skip
     return None if bool(failed) else (lead, members, made)

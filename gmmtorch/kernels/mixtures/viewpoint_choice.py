@@ -25,13 +25,13 @@ def viewpoint_choice(
     (J,), None for all; and whether it is known that every origin has one.
     """
     device, (n_origins, dim), e = by.device, origins.shape, len(by)
-    given = [part.contiguous() for part in (by.argsort(stable=True), by, seen_from, count, origins)]
+    given = by.argsort(stable=True), by, seen_from, count, origins
     gain, nearest, scaled = torch.empty(3, e, dtype=count.dtype, device=device)
     flags = torch.zeros(e + n_origins, dtype=torch.bool, device=device)
     counts = torch.zeros(SELECTION_COUNTS + 2, dtype=torch.int32, device=device)
     team, is_kept = Team.of(device), flags[:e]
     choice = gain, nearest, scaled, is_kept, flags[e:], counts[SELECTION_COUNTS:]
-    sizes, table = (len(support), e), (n_origins, support.contiguous())
-    _CHOICES[dim](team.n, *team, *sizes, *given, *table, *choice, most, limit, counts, device=device)
+    sizes, table = (len(support), e), (n_origins, support)
+    _CHOICES[dim](team.n, *team, *sizes, *given, *table, *choice, most, limit, counts)
     n_kept, n_used = counts[SELECTION_COUNTS:].tolist()
     return scaled, None if n_kept == e else is_kept.nonzero().squeeze(1), n_used == n_origins

@@ -47,15 +47,15 @@ def list_counted_cells(low: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tenso
         cells = cells[((x * n_blocks[1] + y) * n_blocks[2] + z).argsort(stable=True)]
         some = [counts[cells.unbind(1)].float() for counts in (hits, misses)]
         return cells + low, some[0], some[1]
-    given = *hits.shape, *n_blocks[1:], _BLOCK_BITS, hits.contiguous(), misses.contiguous(), low.contiguous()
+    given = *hits.shape, *n_blocks[1:], _BLOCK_BITS, hits, misses, low
     n_items = math.prod(n_blocks)
     in_block = torch.empty(n_items, dtype=torch.int64, device=device)
-    _LIST(n_items, *given, in_block, None, None, None, device=device)
+    _LIST(n_items, *given, in_block, None, None, None)
     until = torch.cumsum(in_block, 0)
     n = int(until[-1])
     cells = torch.empty(n, 3, dtype=torch.int64, device=device)
     listed = torch.empty(2, n, device=device)
-    _LIST(n_items, *given, until - in_block, cells, listed[0], listed[1], device=device)
+    _LIST(n_items, *given, until - in_block, cells, listed[0], listed[1])
     return cells, listed[0], listed[1]
 
 
@@ -71,8 +71,7 @@ def add_counts(counts: Tensor, index: Tensor, hits: Tensor, misses: Tensor) -> t
     if is_fused(counts, index, hits, misses) and counts.dtype == hits.dtype == misses.dtype == torch.float32:
         before = torch.empty(2, n, device=counts.device)
         run = _RUN if counts.device.type == "cpu" else 1
-        more = index.contiguous(), hits.contiguous(), misses.contiguous()
-        _ADD(-(-n // run), n, run, *more, counts[0].numel(), counts, before, device=counts.device)
+        _ADD(-(-n // run), n, run, index, hits, misses, counts[0].numel(), counts, before)
         return before[0], before[1]
     inside = index > 0
     olds = [part.view(-1).index_select(0, index) for part in counts]
@@ -91,8 +90,7 @@ def flags_of_cells(cells: Tensor, low: Tensor, flags: Tensor) -> Tensor:
     if is_fused(cells, low, flags):
         n, found = len(cells), torch.empty_like(cells[:, 0], dtype=torch.bool)
         run = _RUN if cells.device.type == "cpu" else 1
-        given = cells.contiguous(), low.contiguous(), nx, ny, nz, flags.contiguous()
-        _FLAGS(-(-n // run), n, run, *given, found, device=cells.device)
+        _FLAGS(-(-n // run), n, run, cells, low, nx, ny, nz, flags, found)
         return found
     x, y, z = (cells - low).unbind(1)
     inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
@@ -122,14 +120,9 @@ def cell_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
     if is_fused(cells, blocks.keys, blocks.bounds):
         run = _INDEX_RUN if cells.device.type == "cpu" else 1
         index, (n, dim) = torch.empty_like(cells[:, 0]), cells.shape
-        table = (
-            blocks.keys.contiguous(),
-            blocks.slots.contiguous(),
-            len(blocks.keys),
-            blocks.bounds.contiguous(),
-        )
+        table = blocks.keys, blocks.slots, len(blocks.keys), blocks.bounds
         bits = blocks.local_bits, blocks.axis_bits
-        _INDEX(-(-n // run), cells.contiguous(), n, dim, run, *table, *bits, index, device=cells.device)
+        _INDEX(-(-n // run), cells, n, dim, run, *table, *bits, index)
         return index
     return _batched_index(cells, blocks)
 
@@ -187,8 +180,7 @@ def entropy_removed(
     if is_fused(*before, *added, chosen) and before[0].dtype == torch.float32:
         n = len(chosen)
         sums = torch.empty(-(-n // _RUN), 3, dtype=torch.float64, device=chosen.device)
-        values = [value.contiguous() for value in (*before, *added, chosen)]
-        _REMOVED(len(sums), n, _RUN, *values, prior, clamp, sums, device=chosen.device)
+        _REMOVED(len(sums), n, _RUN, *before, *added, chosen, prior, clamp, sums)
         bits, chosen_bits, n_new = sums.sum(0).tolist()
         return Removed(bits, chosen_bits, int(n_new))
     (h, m), (more_h, more_m) = before, added
@@ -231,8 +223,7 @@ def reduction_along_rays(
         hits, misses = (torch.nn.functional.pad(counts, (margin,) * 6) for counts in (hits, misses))
         rays = rays_argument(starts.double(), stops.double(), shape, row_major_strides(shape), low)
         sums = torch.empty(len(starts), dtype=torch.float64, device=starts.device)
-        counts = hits.contiguous(), misses.contiguous()
-        _ALONG(len(starts), *rays, *counts, prior, observed, mark, table, sums, device=starts.device)
+        _ALONG(len(starts), *rays, hits, misses, prior, observed, mark, table, sums)
         return sums
     h, m = hits.double(), misses.double()
     bits = cell_entropy(h, m, prior) - cell_entropy(h, m + 1, prior) + mark * (h + m < observed)

@@ -72,31 +72,11 @@ def cast_components(
     failed = torch.zeros(1, dtype=torch.bool, device=device)
     parts = 1 if device.type == "cpu" else _PARTS
     points = sobol_points(most * hits_per_ray, str(device))
-    _CAST(
-        len(seen.rays) * parts,
-        *(value.contiguous() for value in (means, covariances, origins, max_range, ids, *seen)),
-        points,
-        points.shape[1],
-        _shrinkages(cutoff, str(device)),
-        _RADII + 2,
-        _RADII / _FARTHEST_DRAW,
-        bounds.contiguous(),
-        parts,
-        resolution,
-        TIE,
-        torch.tensor(rays_per_cell, dtype=torch.float64, device=device),
-        least,
-        most,
-        torch.tensor(cutoff, dtype=torch.float64, device=device),
-        EFFECTIVE_AREA,
-        shell,
-        hits_per_ray,
-        THINNING if thinned else 0,
-        hits,
-        misses,
-        failed,
-        device=device,
-    )
+    table = _shrinkages(cutoff, str(device)), _RADII + 2, _RADII / _FARTHEST_DRAW
+    per_cell, ends = (means.new_tensor(pair) for pair in (rays_per_cell, cutoff))
+    given = means, covariances, origins, max_range, ids, *seen, points, points.shape[1], *table, bounds
+    rule = per_cell, least, most, ends, EFFECTIVE_AREA, shell, hits_per_ray, THINNING if thinned else 0
+    _CAST(len(seen.rays) * parts, *given, parts, resolution, TIE, *rule, hits, misses, failed)
     return None if bool(failed) else (hits, misses)
 
 

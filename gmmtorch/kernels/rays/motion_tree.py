@@ -107,7 +107,7 @@ class MotionTree:
         """The number of new leaves in round `turn`, at most `most`. orders: (n, P), of the motions from the
         nodes that were opened last. action: the only leaf is that below the newest node."""
         before = self.n_nodes
-        _CHOOSE(1, *self._tables, orders.contiguous(), most, turn, action, device=orders.device)
+        _CHOOSE(1, *self._tables, orders, most, turn, action)
         return self.n_nodes - before
 
     def open(
@@ -127,7 +127,7 @@ class MotionTree:
         (V, G) and of what is left (V, G).
         """
         state = *self._tables, *library, *space
-        _OPEN(1, *state, longest, spacing, n, is_last, *views, device=longest.device)
+        _OPEN(1, *state, longest, spacing, n, is_last, *views)
 
     def best(self) -> tuple[list[int], list[int], float, float, float] | None:
         """Nodes and motions of the branch to the node with the largest return, the return, its information,

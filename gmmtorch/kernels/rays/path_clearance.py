@@ -71,21 +71,8 @@ def motions_are_clear(
 
     A motion differs from the twin's only if it meets an edge of a cell, or the separation, within rounding.
     """
-    device = starts.device
-    clear = torch.empty(ends.shape[:2], dtype=torch.bool, device=device)
+    clear = torch.empty(ends.shape[:2], dtype=torch.bool, device=starts.device)
     turns = [torch.stack([poses[..., 3].cos(), poses[..., 3].sin()], -1) for poses in (starts, ends)]
-    _KERNEL(
-        clear.numel(),
-        *library,
-        *space,
-        follows,
-        starts.contiguous(),
-        turns[0],
-        ends.contiguous(),
-        turns[1],
-        n_parts,
-        first,
-        clear,
-        device=device,
-    )
+    given = follows, starts, turns[0], ends, turns[1], n_parts, first
+    _KERNEL(clear.numel(), *library, *space, *given, clear)
     return clear

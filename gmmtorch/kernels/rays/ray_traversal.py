@@ -203,9 +203,9 @@ def rays_argument(
 ) -> list[Tensor | float]:
     """The fields of `Rays` of `ray_walk.h`. unit: 1/n if n finer voxels make a voxel and ties are theirs."""
     dim = len(shape)
-    low = starts.new_zeros(dim) if low is None else low.double().contiguous()
+    low = starts.new_zeros(dim) if low is None else low.double()
     sizes, pad = [*shape, *[1] * (3 - dim)], [0] * (3 - dim)
-    return [starts.contiguous(), ends.contiguous(), low, dim, *sizes, *strides, *pad, TIE, unit]
+    return [starts, ends, low, dim, *sizes, *strides, *pad, TIE, unit]
 
 
 _COUNT_VISITS = FusedKernel(_SOURCE, "count_visits")
@@ -223,7 +223,7 @@ def _fused(
     device = starts.device
     rays = rays_argument(starts, ends, shape, strides, low)
     counts = torch.empty(starts.shape[0], dtype=torch.int64, device=device)
-    _COUNT_VISITS(starts.shape[0], *rays, counts, device=device)
+    _COUNT_VISITS(starts.shape[0], *rays, counts)
     stops = torch.cumsum(counts, 0)
     cuts = _chunk_bounds(counts, chunk_visits)
     sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
@@ -240,7 +240,7 @@ def _listed(
     first, last = begin + part.start, begin + part.stop
     before, after = (known[ray] if ray in known else int(stops[ray - 1]) for ray in (first, last))
     visits = Visits(*torch.empty(2, after - before, dtype=torch.int64, device=stops.device))
-    _LIST_VISITS(last - first, first, stops, *visits, *rays, device=stops.device)
+    _LIST_VISITS(last - first, first, stops, *visits, *rays)
     return visits
 
 
@@ -322,7 +322,7 @@ def count_in_grid(
         weights: (R,); ones if not given.
         chunk_visits: of the twin, see `traverse`.
     """
-    weights = None if weights is None else weights.double().contiguous()
+    weights = None if weights is None else weights.double()
     starts, ends = starts.double(), ends.double()
     if is_fused(counts, starts, ends, weights, low):
         rays = rays_argument(starts, ends, shape, row_major_strides(shape), low)
@@ -330,7 +330,7 @@ def count_in_grid(
         many = is_gpu and weights is None and counts.numel() < _CELLS_A_RAY * n_rays < _CELLS_A_RAY << 31
         added = torch.zeros_like(counts, dtype=torch.int32) if many else counts
         n_items = _n_items(n_rays, counts.device)
-        _IN_GRID[added.dtype](n_items, n_rays, *rays, weights, added, device=counts.device)
+        _IN_GRID[added.dtype](n_items, n_rays, *rays, weights, added)
         if many:
             counts += added
         return
@@ -374,7 +374,7 @@ def count_in_blocks(
         chunk_visits: of the twin, see `traverse`.
     """
     starts, ends = starts.double(), ends.double()
-    weights = None if weights is None else weights.to(counts().dtype).contiguous()
+    weights = None if weights is None else weights.to(counts().dtype)
     low = table.low * (1 << table.local_bits)
     if is_fused(counts(), starts, ends, weights):
         _count_in_blocks_fused(counts, table, starts, ends, weights, low)
@@ -408,7 +408,7 @@ def _count_in_blocks_fused(
     shape = tuple(1 << b for b in table.bits)
     strides = packed_strides(table.bits)
     rays = rays_argument(starts / side, ends / side, shape, strides, table.low, unit=1 / side)
-    _MARK(n_rays, *rays, marked, device=device)
+    _MARK(n_rays, *rays, marked)
     new = (marked & (table.first < 0)).nonzero().squeeze(1)
     if new.numel():
         table.open(new)
@@ -420,7 +420,7 @@ def _count_in_blocks_fused(
     fields = [table.local_bits, shifts[0], shifts[1], (1 << bits[1]) - 1, mask2, above[0], above[1]]
     kernel = _IN_BLOCKS[counts().dtype]
     n_items = _n_items(n_rays, device)
-    kernel(n_items, n_rays, *rays, table.first, *fields, weights, counts(), device=device)
+    kernel(n_items, n_rays, *rays, table.first, *fields, weights, counts())
 
 
 def mark_cells_of_rays(
@@ -437,7 +437,7 @@ def mark_cells_of_rays(
     strides = row_major_strides(shape)
     if is_fused(marks, starts, stops, is_hit, low):
         rays = rays_argument(starts, stops, shape, strides, low)
-        _MARK_BITS(len(stops), *rays, is_hit.contiguous(), bit, marks, device=marks.device)
+        _MARK_BITS(len(stops), *rays, is_hit, bit, marks)
         return
     flat = marks.view(-1)
     for visit in traverse(starts, stops, shape, low=low):
