@@ -8,7 +8,7 @@ from .chunks import memory_error as memory_error
 from .codes.context_coding import ChanceTables as ChanceTables
 from .codes.context_coding import CodedBatch as CodedBatch
 from .codes.context_coding import context_coding as context_coding
-from .codes.number_coding import number_coding as number_coding
+from .codes.context_coding import number_coding as number_coding
 from .evidence.beam_passes import PassLimits as PassLimits
 from .evidence.beam_passes import beam_passes as beam_passes
 from .evidence.grid_flux import add_cell_mass as add_cell_mass
@@ -68,12 +68,12 @@ from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
 from .mixtures.pair_merges import is_pair_merges_fused as is_pair_merges_fused
 from .mixtures.pair_merges import pair_merges as pair_merges
+from .mixtures.pair_merges import viewpoint_choice as viewpoint_choice
 from .mixtures.small_fits import fused_em as fused_em
 from .mixtures.small_fits import fused_kmeans as fused_kmeans
 from .mixtures.small_fits import fused_moments as fused_moments
 from .mixtures.small_fits import is_kmeans_fused as is_kmeans_fused
 from .mixtures.small_fits import is_small as is_small
-from .mixtures.viewpoint_choice import viewpoint_choice as viewpoint_choice
 from .rays.beam_information import Beams as Beams
 from .rays.beam_information import Cells as Cells
 from .rays.beam_information import information_by_block as information_by_block
@@ -92,10 +92,10 @@ from .rays.component_casting import Seen as Seen
 from .rays.component_casting import cast_components as cast_components
 from .rays.component_casting import hidden_area as hidden_area
 from .rays.component_casting import truncated_normals as truncated_normals
+from .rays.motion_tree import FreeSpace as FreeSpace
+from .rays.motion_tree import Library as Library
 from .rays.motion_tree import MotionTree as MotionTree
-from .rays.path_clearance import FreeSpace as FreeSpace
-from .rays.path_clearance import Library as Library
-from .rays.path_clearance import motions_are_clear as motions_are_clear
+from .rays.motion_tree import motions_are_clear as motions_are_clear
 from .rays.range_views import range_views as range_views
 from .rays.ray_traversal import CHUNK_VISITS as CHUNK_VISITS
 from .rays.ray_traversal import BlockTable as BlockTable

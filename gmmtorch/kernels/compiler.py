@@ -153,7 +153,7 @@ class FusedKernel:
         return struct.Struct("=" + "".join("Q" if p.pointer else _TYPES[p.cpp][1] for p in self._parameters))
 
     def _values(self, arguments: tuple[Tensor | float | None, ...]) -> tuple[list[float], list[Tensor]]:
-        """What is passed, addresses of tensors and 0 for None; and the tensors, which must live until then."""
+        """Numbers, with the address for a tensor and 0 for None; and the tensors, which a launch needs."""
         values: list[float] = []
         tensors = []
         for parameter, argument in zip(self._parameters, arguments, strict=True):

@@ -312,16 +312,11 @@ def _tangent_slopes(toward: Tensor, scaled: Tensor, a: int, b: int) -> tuple[Ten
     return low, high
 
 
-class BallRows(NamedTuple):
-    """Boxes of cells around R ellipsoids: cone (R,); lowest cell `first` and `number` of cells, (R, D)."""
+def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes of cells that ellipsoids can meet: cone (R,), lowest cell and number of cells (R, D) of each.
 
-    cone: Tensor
-    first: Tensor
-    number: Tensor
-
-
-def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> BallRows:
-    """Cells that the ellipsoid of each cone can meet; cones of no-return beams have none."""
+    Cones of no-return beams have none.
+    """
     cone = (~cones.max_range).nonzero().squeeze(1)
     mean = grid.to_units(cones.means[cone].detach())
     variance = cones.covariances[cone].detach().double().diagonal(dim1=-2, dim2=-1)
@@ -329,4 +324,4 @@ def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> BallRows
     size = torch.tensor(grid.shape, dtype=torch.float64, device=mean.device)
     low = (mean - spread).floor().clamp(mean.new_zeros(()), size).long()
     high = (mean + spread).ceil().clamp(mean.new_zeros(()), size).long()
-    return BallRows(cone, low, high - low)
+    return cone, low, high - low

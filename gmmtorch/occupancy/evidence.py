@@ -44,11 +44,6 @@ class CellClass(IntEnum):
     OCCUPIED = 1
 
 
-def bernoulli_variance(probability: Tensor) -> Tensor:
-    """θ(1 − θ): ¼ for an unknown cell, 0 for a certain cell."""
-    return probability * (1 - probability)
-
-
 def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:
     """`CellClass` values (int8) of probabilities, any shape, with the dead band of thesis (3.10).
 
@@ -129,8 +124,9 @@ class Evidence:
         return self._theta(self.hits, self.misses, prior)
 
     def variance(self, prior: float | None = None) -> Tensor:
-        """θ(1 − θ) of each cell."""
-        return bernoulli_variance(self.probability(prior))
+        """θ(1 − θ) of each cell: ¼ for an unknown cell, 0 for a certain cell."""
+        theta = self.probability(prior)
+        return theta * (1 - theta)
 
     def entropy(self, prior: float | None = None) -> Tensor:
         """Entropy of each cell in bits."""

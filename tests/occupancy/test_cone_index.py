@@ -363,11 +363,11 @@ def test_a_face_that_a_ray_crosses_is_visited(dim, seed):
 def test_ball_rows_contain_all_ends():
     grid, cones = GRIDS[3], some_cones(3, 4, 2)
     cones = cones._replace(max_range=torch.tensor([False, True, False, False]))
-    rows = ball_rows(cones, grid)
-    assert rows.cone.tolist() == [0, 2, 3]
-    held = {index: set() for index in rows.cone.tolist()}
-    for row, cells in cells_in_chunks(rows.first, rows.number, 77):
-        for index, *cell in zip(rows.cone[row].tolist(), *(c.tolist() for c in cells), strict=True):
+    cone, first, number = ball_rows(cones, grid)
+    assert cone.tolist() == [0, 2, 3]
+    held = {index: set() for index in cone.tolist()}
+    for row, cells in cells_in_chunks(first, number, 77):
+        for index, *cell in zip(cone[row].tolist(), *(c.tolist() for c in cells), strict=True):
             held[index].add(tuple(cell))
     for index, cells in held.items():
         place = grid.to_units(ends_within(only(cones, index), 300)).floor().long()

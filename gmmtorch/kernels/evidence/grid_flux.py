@@ -73,7 +73,7 @@ def add_cell_mass(
     Args:
         hits: (cells,) float64, row-major; or (M,), of any cells, if `target` is given.
         cones, counts: as in `add_row_flux`.
-        boxes: cone (R,) and first, number (R, D) of `BallRows` (`occupancy.cones`).
+        boxes: cone (R,), lowest cell and number of cells (R, D), see `occupancy.cones.ball_rows`.
         grid, limits, target: as in `add_row_flux`.
     """
     origin, side, shape = grid

@@ -87,12 +87,13 @@ def _fused(
     n_own = beams.per_view if device.type == "cpu" else 1
     n_items = n_views * beams.per_view // n_own
     gain, taken = torch.zeros(2, n_views, cells.n_blocks, device=device)
-    sizes = n_templates, n_columns, beams.leading.shape[-1], len(beams.kernel), cells.n_blocks
+    sizes = beams.per_view, n_own, n_templates, n_columns, beams.leading.shape[-1], len(beams.kernel)
     tables = beams.lengths, beams.leading, beams.ahead, beams.volumes, beams.kernel
-    given = cameras, yaw, *cells.shape, beams.per_view, n_own, *sizes, *tables
-    scratch = torch.empty(n_items, 6, n_columns, device=device)
+    places = cells.offsets, cells.occupancy, cells.block
     rule = shannon_information, math.log(IMAGE_ODDS)
-    _KERNEL(n_items, *given, cells.offsets, cells.occupancy, cells.block, *rule, scratch, gain, taken)
+    made = torch.empty(n_items, 6, n_columns, device=device), gain, taken
+    given = *cells.shape, *sizes, cells.n_blocks
+    _KERNEL(n_items, cameras, yaw, *given, *tables, *places, *rule, *made)
     return gain, taken
 
 

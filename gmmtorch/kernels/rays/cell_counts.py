@@ -229,8 +229,8 @@ def reduction_along_rays(
     bits = cell_entropy(h, m, prior) - cell_entropy(h, m + 1, prior) + mark * (h + m < observed)
     table = torch.nn.functional.pad(bits, (margin,) * 6).view(-1)
     sums = torch.zeros(len(starts), dtype=torch.float64, device=starts.device)
-    for visit in traverse(starts, stops, shape, _CHUNK_VISITS, low=low):
-        sums.index_add_(0, visit.ray, table.index_select(0, visit.voxel))
+    for voxel, ray in traverse(starts, stops, shape, _CHUNK_VISITS, low=low):
+        sums.index_add_(0, ray, table.index_select(0, voxel))
     return sums
 
 

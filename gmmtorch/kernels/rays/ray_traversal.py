@@ -37,11 +37,8 @@ CHUNK_VISITS = 1 << 18
 """Voxel visits in one pass: they fit a core's cache."""
 
 
-class Visits(NamedTuple):
-    """Voxels that rays leave: flat voxel index (V,) and ray index (V,), both int64."""
-
-    voxel: Tensor
-    ray: Tensor
+Visits = tuple[Tensor, Tensor]
+"""Voxels that rays leave: flat voxel index (V,) and ray index (V,), both int64."""
 
 
 class _Rays(NamedTuple):
@@ -140,7 +137,7 @@ def _crossings(rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: in
             inside &= (index >= 0) & (index < shape[other])
         voxel = torch.addcmul(voxel, index, each(signed[:, other]))
     voxel = voxel.long()
-    return Visits(voxel[inside], ray[inside]) if masked else Visits(voxel, ray)
+    return (voxel[inside], ray[inside]) if masked else (voxel, ray)
 
 
 def _slack(rays: _Rays, axis: int, other: int) -> Tensor:
@@ -239,9 +236,9 @@ def _listed(
     """Visits of a run of rays; `known`: how many visits come before a ray, where Python has this number."""
     first, last = begin + part.start, begin + part.stop
     before, after = (known[ray] if ray in known else int(stops[ray - 1]) for ray in (first, last))
-    visits = Visits(*torch.empty(2, after - before, dtype=torch.int64, device=stops.device))
-    _LIST_VISITS(last - first, first, stops, *visits, *rays)
-    return visits
+    voxel, ray = torch.empty(2, after - before, dtype=torch.int64, device=stops.device)
+    _LIST_VISITS(last - first, first, stops, voxel, ray, *rays)
+    return voxel, ray
 
 
 def _batched(
@@ -263,7 +260,7 @@ def _batched(
         masked = not bool(fits[begin:stop].all())
         for axis in range(len(shape)):
             crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked)
-            yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found.voxel))
+            yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found[0]))
 
 
 def _crossings_of(
@@ -278,8 +275,8 @@ def _crossings_of(
     """`_crossings` of a run of rays that starts at `begin`."""
     first, last = begin + part.start, begin + part.stop
     some = _Rays(*(field[first:last] for field in rays))
-    found = _crossings(some, shape, strides, axis, masked)
-    return Visits(found.voxel, found.ray + first if first else found.ray)
+    voxel, ray = _crossings(some, shape, strides, axis, masked)
+    return voxel, ray + first if first else ray
 
 
 def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:
@@ -335,9 +332,8 @@ def count_in_grid(
             counts += added
         return
     one = torch.ones((), dtype=torch.float64, device=counts.device)
-    for visit in traverse(starts, ends, shape, chunk_visits, low=low):
-        source = one.expand(visit.voxel.shape) if weights is None else weights[visit.ray]
-        counts.scatter_add_(0, visit.voxel, source)
+    for voxel, ray in traverse(starts, ends, shape, chunk_visits, low=low):
+        counts.scatter_add_(0, voxel, one.expand(voxel.shape) if weights is None else weights[ray])
 
 
 class BlockTable(NamedTuple):
@@ -382,13 +378,13 @@ def count_in_blocks(
     bits = tuple(b + table.local_bits for b in table.bits)
     one = torch.ones((), dtype=counts().dtype, device=starts.device)
     shape, strides = tuple(1 << b for b in bits), packed_strides(bits)
-    for visit in traverse(starts, ends, shape, chunk_visits, strides, low):
-        block, place = _split(visit.voxel, table.bits, table.local_bits)
+    for voxel, ray in traverse(starts, ends, shape, chunk_visits, strides, low):
+        block, place = _split(voxel, table.bits, table.local_bits)
         first = table.first.index_select(0, block)
         if int(first.min()) < 0:
             table.open(block[first < 0].long().unique())
             first = table.first.index_select(0, block)
-        source = one.expand(first.shape) if weights is None else weights[visit.ray]
+        source = one.expand(first.shape) if weights is None else weights[ray]
         counts().scatter_add_(0, first.add_(place), source)
 
 
@@ -440,8 +436,8 @@ def mark_cells_of_rays(
         _MARK_BITS(len(stops), *rays, is_hit, bit, marks)
         return
     flat = marks.view(-1)
-    for visit in traverse(starts, stops, shape, low=low):
-        flat[visit.voxel] |= bit
+    for voxel, _ in traverse(starts, stops, shape, low=low):
+        flat[voxel] |= bit
     ends = stops[is_hit].floor().long() - low
     inside = ((ends >= 0) & (ends < torch.tensor(shape, device=ends.device))).all(1)
     flat[(ends[inside] * torch.tensor(strides, device=ends.device)).sum(1)] |= bit

@@ -191,8 +191,8 @@ def flux_evidence(
     for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
         misses = _add_faces(misses, white, counts, grid, axis, rows, how)
     hits = torch.zeros_like(misses)
-    for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
-        cone, low = balls.cone[row], _world(grid, cell.double())
+    for row, cell in cells_in_chunks(*balls[1:], CHUNK_FACES):
+        cone, low = balls[0][row], _world(grid, cell.double())
         mass = box_mass(white.take(cone), low, low + grid.resolution, *how)
         hits = hits.index_add(0, row_major(cell.unbind(), grid.shape), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))

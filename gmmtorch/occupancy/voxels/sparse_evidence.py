@@ -96,8 +96,8 @@ def _bytes_needed(
     low = blocks.amin(0)
     shape = tuple((blocks.amax(0) - low + 1).long().tolist())
     touched = torch.zeros(math.prod(shape), dtype=torch.bool, device=low.device)
-    for visit in traverse(starts, stops, shape, low=low):
-        touched[visit.voxel] = True
+    for voxel, _ in traverse(starts, stops, shape, low=low):
+        touched[voxel] = True
     # The traversal leaves out the blocks of the ends. Earlier blocks shrink at least in proportion.
     n_ends = torch.unique(stops.floor(), dim=0).shape[0]
     n_earlier = math.ceil(earlier * store.resolution / resolution)
@@ -364,13 +364,9 @@ class SparseEvidence(SparseLattice):
 
     def at_cells(self, cells: Tensor) -> tuple[Tensor, Tensor]:
         """Hits (C,) and misses (C,) of cells (C, D); 0 without evidence."""
-        columns = self.columns(cells)
-        reachable = self.reachable(columns)
-        columns = [torch.where(reachable, column, 0).long() for column in columns]
-        keys = torch.where(reachable, self.block_keys(columns), -1)
-        runs, run = torch.unique_consecutive(keys, return_inverse=True)
-        first = self._first_of(runs)[run]
-        index = torch.where(first > 0, first + self.places(columns), 0)
+        reachable = self.reachable(self.columns(cells))
+        index = self._index_of(torch.where(reachable[:, None], cells, 0).long()).clamp_min_(0)
+        index = torch.where(reachable, index, 0)
         hits, misses = (counts.view(-1).index_select(0, index) for counts in self.counts)
         return hits, misses
 

@@ -32,8 +32,8 @@ def visited(starts: Tensor, ends: Tensor, shape: tuple[int, ...], **options) -> 
     strides = options.get("strides") or row_major_strides(shape)
     found = []
     for chunk in traverse(starts, ends, shape, **options):
-        assert chunk.voxel.dtype == chunk.ray.dtype == torch.int64
-        for voxel, ray in zip(chunk.voxel.tolist(), chunk.ray.tolist(), strict=True):
+        assert {part.dtype for part in chunk} == {torch.int64}
+        for voxel, ray in zip(*(part.tolist() for part in chunk), strict=True):
             index = []
             for axis in sorted(range(len(shape)), key=lambda a: -strides[a]):
                 index.append((axis, voxel // strides[axis]))
@@ -208,7 +208,7 @@ def test_visits_do_not_depend_on_the_chunk_size(chunk, margin):
 
 def test_chunks_have_about_the_requested_size():
     starts, ends = random_rays(5000, (50, 50), 0.0, 2.0**-10)
-    sizes = [chunk.voxel.numel() for chunk in traverse(starts, ends, (50, 50), chunk_visits=1000)]
+    sizes = [voxel.numel() for voxel, _ in traverse(starts, ends, (50, 50), chunk_visits=1000)]
     assert len(sizes) > 50
     assert max(sizes) <= 1000 + 100  # one ray more, at most
 
@@ -245,7 +245,7 @@ def test_a_ray_of_500_km_costs_no_more_than_the_grid(direction):
     offset = torch.tensor([direction]).double() * length
     starts, ends = middle - offset, middle + offset
     with LargestTensor() as work:
-        n = sum(chunk.voxel.numel() for chunk in traverse(starts, ends, shape))
+        n = sum(voxel.numel() for voxel, _ in traverse(starts, ends, shape))
     assert 0 < n <= sum(shape)
     assert work.largest < 4 * sum(shape)
 
