@@ -34,7 +34,6 @@ from .mixtures.cell_sums import distinct_keys as distinct_keys
 from .mixtures.cell_sums import piece_cuts as piece_cuts
 from .mixtures.cell_sums import range_sums as range_sums
 from .mixtures.cell_sums import value_sums as value_sums
-from .mixtures.em_loops import TruncatedLimits as TruncatedLimits
 from .mixtures.em_loops import fused_exact_em as fused_exact_em
 from .mixtures.em_loops import fused_truncated_em as fused_truncated_em
 from .mixtures.em_loops import is_em_fused as is_em_fused
@@ -97,7 +96,6 @@ from .rays.motion_tree import Library as Library
 from .rays.motion_tree import MotionTree as MotionTree
 from .rays.motion_tree import motions_are_clear as motions_are_clear
 from .rays.range_views import range_views as range_views
-from .rays.ray_traversal import CHUNK_VISITS as CHUNK_VISITS
 from .rays.ray_traversal import BlockTable as BlockTable
 from .rays.ray_traversal import count_in_blocks as count_in_blocks
 from .rays.ray_traversal import count_in_grid as count_in_grid

@@ -149,7 +149,7 @@ def test_counts_do_not_depend_on_order_chunks_and_portions():
     whole, parts = Evidence.empty(grid), Evidence.empty(grid)
     whole.add_rays(origins, ends)
     for part in order.split(37):
-        parts.add_rays(origins[part], ends[part], chunk_visits=5)
+        parts.add_rays(origins[part], ends[part])
     assert torch.equal(whole.hits, parts.hits)
     assert torch.equal(whole.misses, parts.misses)
 

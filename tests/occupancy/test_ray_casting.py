@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from occupancy.exact_dda import voxels_left
 from torch import Tensor
 
-import gmmtorch.occupancy.voxels.ray_casting as module
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, occupied_cells, sum_evidence, to_lattice
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
@@ -111,11 +110,10 @@ def test_evidence_of_disjoint_boxes_sums_to_the_whole(seed, axis):
         assert found[cell] == pytest.approx(both, rel=1e-6)
 
 
-def test_counts_do_not_depend_on_order_and_chunks(monkeypatch):
+def test_counts_do_not_depend_on_order():
     starts, stops, is_hit = random_rays(300, 1)
     expected = {b: counts(cast_evidence(starts, stops, is_hit, 1.0, w)) for b, w in enumerate((SMALL, LARGE))}
     order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
-    monkeypatch.setattr(module, "_CHUNK_VISITS", 7)
     for b, within in enumerate((SMALL, LARGE)):
         shuffled = cast_evidence(starts[order], stops[order], is_hit[order], 1.0, within)
         assert counts(shuffled) == expected[b]

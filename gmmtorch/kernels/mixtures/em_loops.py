@@ -33,23 +33,12 @@ _EXACT = {
     (dim, wide): FusedKernel("mixtures/em_loops.h", f"exact_em<{dim}, {str(wide).lower()}>")
     for dim, wide in itertools.product(DIMENSIONS, (False, True))
 }
-
-
 _TRUNCATED = {
     (dim, wide): FusedKernel("mixtures/em_loops.h", f"truncated_em<{dim}, {str(wide).lower()}>")
     for dim, wide in itertools.product(DIMENSIONS, (False, True))
 }
 _SAMPLES = 64  # most rows of a group that are compared with all components
 _SORTED_PARTS, _MOST_COUNTS = 512, 1 << 22
-
-
-class Run(NamedTuple):
-    """A mixture, the bounds of the iterations that led to it, and whether the next iteration needs the twin,
-    which repairs a covariance, or takes a direct step."""
-
-    mixture: Mixture
-    bounds: list[float]
-    failed: bool
 
 
 def is_em_fused(features: Tensor, *others: Tensor) -> bool:
@@ -73,9 +62,12 @@ def fused_exact_em(
     last_bound: float = -math.inf,
     guarded: bool = False,
     team: Team | None = None,
-) -> Run:
+) -> tuple[Mixture, list[float], bool]:
     """Exact EM on features (N, F) of weight (N,) until the bound changes by less than `tol`, at first from
     `last_bound`. A launch has a limit, so a run may end before that and before `max_iter` (1 or more).
+
+    Returns the mixture, the bounds of the iterations, and whether the next one needs the twin, which repairs
+    a covariance, or takes a direct step.
 
     guarded: end also before an iteration whose natural parameters or statistics lose digits. team: other
     workers than those of the device; several on a CPU are launched for each phase.
@@ -89,15 +81,8 @@ def fused_exact_em(
     size, n_sums = k * (1 + dim + dim * dim), n_parts * padded * width
     near = n_parts * padded
     scratch = (2 * n, near * (CPU_LANES + 1), 2 * near) if wide else (n, 0, 0)
-    tables = (
-        k,
-        padded * width,
-        padded * width,
-        k * width + 2,
-        n_sums * (CPU_LANES if wide else 1),
-        *scratch,
-        1,
-    )
+    n_partial = n_sums * (CPU_LANES if wide else 1)
+    tables = k, padded * width, padded * width, k * width + 2, n_partial, *scratch, 1
     head, mixtures, masses, natural, table, *others = _carved(
         features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED, MERGED
     )
@@ -108,7 +93,7 @@ def fused_exact_em(
     _launch(_EXACT[dim, wide], team, head, (*rows, *limits), made)
     (_, n_done, state, which, *_), bounds = _read(head)
     found = _mixture(mixtures[which * size :][:size].clone(), k, dim)
-    return Run(found, bounds[:n_done], state == _IMPOSSIBLE)
+    return found, bounds[:n_done], state == _IMPOSSIBLE
 
 
 class TruncatedRun(NamedTuple):
@@ -124,15 +109,6 @@ class TruncatedRun(NamedTuple):
     candidates: Tensor
 
 
-class TruncatedLimits(NamedTuple):
-    """Limits of a run: see `mixture.em.truncated.Settings`."""
-
-    reg_covar: float
-    tol: float
-    previous_bound: float
-    max_iter: int
-
-
 def n_sampled_rows(n_components: int) -> int:
     """Rows of a group that are compared with all components."""
     return max(8, min(_SAMPLES, 4096 // n_components))
@@ -143,7 +119,7 @@ def fused_truncated_em(
     weight: Tensor,
     owner: Tensor,
     start: Mixture,
-    limits: TruncatedLimits,
+    limits: tuple[float, float, float, int],
     candidates: Tensor | int,
     repaired: Callable[[Mixture], Tensor],
     summed: Callable[[Tensor], Tensor] | None = None,
@@ -154,6 +130,7 @@ def fused_truncated_em(
 
     Args:
         owner: (N,), the first ones. candidates: the first ones (K, m), or their number m.
+        limits: reg_covar, tol, previous_bound and max_iter of `mixture.em.truncated.Settings`.
         repaired: natural parameters (K, F), about the means, of a mixture with a covariance that is not
             positive definite. summed: sums a vector over the processes that share the fit.
         team: as in `fused_exact_em`.
@@ -165,7 +142,7 @@ def fused_truncated_em(
     )
     width, size, padded = 1 + dim + dim * (dim + 1) // 2, k * (1 + dim + dim * dim), k + -k % CPU_LANES
     n_samples, n_bounds = n_sampled_rows(k), _PAIRS_OF_A_LAUNCH[device.type] // (n * m)
-    n_bounds = max(1, min(limits.max_iter, n_bounds, _MOST_ITERATIONS))
+    n_bounds = max(1, min(limits[3], n_bounds, _MOST_ITERATIONS))
     n_parts = 1 if wide else max(1, min(_SORTED_PARTS, workers.n, _MOST_COUNTS // k))
     if wide:
         of_candidates = (m + -m % 4) * (CPU_LANES * (1 + width) + width)

@@ -151,9 +151,6 @@ def _batched_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
     return torch.where(inside, torch.where(first < 0, -1, first + place), 0)
 
 
-_CHUNK_VISITS = 1 << 16  # of the twin: fastest when cores share a cache
-
-
 class Removed(NamedTuple):
     """Bits removed from all cells and from the chosen ones; chosen cells without evidence before."""
 
@@ -229,7 +226,7 @@ def reduction_along_rays(
     bits = cell_entropy(h, m, prior) - cell_entropy(h, m + 1, prior) + mark * (h + m < observed)
     table = torch.nn.functional.pad(bits, (margin,) * 6).view(-1)
     sums = torch.zeros(len(starts), dtype=torch.float64, device=starts.device)
-    for voxel, ray in traverse(starts, stops, shape, _CHUNK_VISITS, low=low):
+    for voxel, ray in traverse(starts, stops, shape, low=low):
         sums.index_add_(0, ray, table.index_select(0, voxel))
     return sums
 

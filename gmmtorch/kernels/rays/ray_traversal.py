@@ -33,8 +33,7 @@ _SOURCE = "rays/ray_counting.h"
 TIE = 1e-13
 """Distance of crossings that count as one point, relative to the terms: a few hundred times their rounding
 error."""
-CHUNK_VISITS = 1 << 18
-"""Voxel visits in one pass: they fit a core's cache."""
+_CHUNK_VISITS = 1 << 18  # visits in one pass: they fit a core's cache
 
 
 Visits = tuple[Tensor, Tensor]
@@ -163,7 +162,7 @@ def traverse(
     starts: Tensor,
     ends: Tensor,
     shape: tuple[int, ...],
-    chunk_visits: int = CHUNK_VISITS,
+    chunk_visits: int = _CHUNK_VISITS,
     strides: list[int] | None = None,
     low: Tensor | None = None,
 ) -> Iterator[Visits]:
@@ -307,9 +306,7 @@ def count_in_grid(
     ends: Tensor,
     shape: tuple[int, ...],
     weights: Tensor | None = None,
-    *,
     low: Tensor | None = None,
-    chunk_visits: int = CHUNK_VISITS,
 ) -> None:
     """Add the weight of each ray to `counts`, a dense grid, at every voxel that it leaves.
 
@@ -317,7 +314,6 @@ def count_in_grid(
         counts: (voxels,) float64, row-major.
         starts, ends, shape, low: see `traverse`.
         weights: (R,); ones if not given.
-        chunk_visits: of the twin, see `traverse`.
     """
     weights = None if weights is None else weights.double()
     starts, ends = starts.double(), ends.double()
@@ -332,7 +328,7 @@ def count_in_grid(
             counts += added
         return
     one = torch.ones((), dtype=torch.float64, device=counts.device)
-    for voxel, ray in traverse(starts, ends, shape, chunk_visits, low=low):
+    for voxel, ray in traverse(starts, ends, shape, low=low):
         counts.scatter_add_(0, voxel, one.expand(voxel.shape) if weights is None else weights[ray])
 
 
@@ -357,8 +353,6 @@ def count_in_blocks(
     starts: Tensor,
     ends: Tensor,
     weights: Tensor | None,
-    *,
-    chunk_visits: int = CHUNK_VISITS,
 ) -> None:
     """Add the weight of each ray at every voxel that it leaves; stores the blocks of these voxels.
 
@@ -367,7 +361,6 @@ def count_in_blocks(
         table: contains the starts and the ends.
         starts, ends: (R, D) in voxels.
         weights: (R,); ones if not given.
-        chunk_visits: of the twin, see `traverse`.
     """
     starts, ends = starts.double(), ends.double()
     weights = None if weights is None else weights.to(counts().dtype)
@@ -378,7 +371,7 @@ def count_in_blocks(
     bits = tuple(b + table.local_bits for b in table.bits)
     one = torch.ones((), dtype=counts().dtype, device=starts.device)
     shape, strides = tuple(1 << b for b in bits), packed_strides(bits)
-    for voxel, ray in traverse(starts, ends, shape, chunk_visits, strides, low):
+    for voxel, ray in traverse(starts, ends, shape, strides=strides, low=low):
         block, place = _split(voxel, table.bits, table.local_bits)
         first = table.first.index_select(0, block)
         if int(first.min()) < 0:
@@ -449,20 +442,14 @@ def _n_items(n_rays: int, device: torch.device) -> int:
 
 
 def _split(voxel: Tensor, block_bits: tuple[int, ...], local_bits: int) -> tuple[Tensor, Tensor]:
-    """Block in the table, and place in the block, (V,) each, of packed cell indices (V,).
-
-    The field of each axis is cut into block bits and local bits; each kind is packed again.
-    """
+    """Block in the table, and place in the block, (V,) each, of packed cell indices (V,)."""
     bits = tuple(b + local_bits for b in block_bits)
     packed = voxel.int() if sum(bits) < 31 else voxel
-    side_mask = (1 << local_bits) - 1
-    block, place = packed >> local_bits & ((1 << block_bits[-1]) - 1), packed & side_mask
-    for axis in range(len(bits) - 2, -1, -1):
-        shift, width = _fields(bits)[axis][0], block_bits[axis]
-        above = sum(block_bits[axis + 1 :])
-        block = block | ((packed >> (shift + local_bits - above)) & (((1 << width) - 1) << above))
-        low = local_bits * (len(bits) - 1 - axis)
-        place = place | ((packed >> (shift - low)) & (side_mask << low))
+    block, place = torch.zeros_like(packed), torch.zeros_like(packed)
+    for shift, width in _fields(bits):
+        cell = packed >> shift & ((1 << width) - 1)
+        block = block << (width - local_bits) | cell >> local_bits
+        place = place << local_bits | cell & ((1 << local_bits) - 1)
     return block, place
 
 

@@ -10,7 +10,6 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
 from gmmtorch.kernels import (
-    CHUNK_VISITS,
     BlockKeys,
     BlockTable,
     add_counts,
@@ -25,9 +24,7 @@ from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, contains, interse
 from gmmtorch.occupancy.voxels.sparse_lattice import SparseLattice
 
 
-def count_misses(
-    store: SparseEvidence, origins: Tensor, ends: Tensor, weights: Tensor | None, chunk_visits: int
-) -> None:
+def count_misses(store: SparseEvidence, origins: Tensor, ends: Tensor, weights: Tensor | None) -> None:
     """Add one miss to each cell that a ray passes through and leaves, and store the blocks of all ends.
 
     Arguments as in `Evidence.add_rays`. Raises `MemoryLimitError` if the blocks that the rays touch exceed
@@ -48,7 +45,6 @@ def count_misses(
             origins.double() / store.resolution,
             ends.double() / store.resolution,
             weights,
-            chunk_visits=chunk_visits,
         )
     except MemoryLimitError:
         needed = _bytes_needed(store, origins, ends, store.resolution, earlier)
@@ -195,7 +191,6 @@ class SparseEvidence(SparseLattice):
         ends: ArrayLike,
         weights: ArrayLike | None = None,
         is_hit: ArrayLike | None = None,
-        chunk_visits: int = CHUNK_VISITS,
     ) -> None:
         """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
 
@@ -209,7 +204,7 @@ class SparseEvidence(SparseLattice):
         origins, ends, weights, is_hit = checked_rays(origins, ends, weights, is_hit, self.dim, self.device)
         if ends.shape[0] == 0:
             return
-        count_misses(self, origins, ends, weights, chunk_visits)
+        count_misses(self, origins, ends, weights)
         columns = self.columns(self.cells_of(ends).long())
         index = self._first_of(self.block_keys(columns)) + self.places(columns)
         source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights
