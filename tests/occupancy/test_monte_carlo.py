@@ -180,12 +180,6 @@ def test_rays_start_at_the_sensor_origin_and_depend_on_the_seed(sampling):
     assert first.origins.unique(dim=0).tolist() == [[0.0, 0.0, 0.5]]
 
 
-def test_only_no_return_components_add_no_hits():
-    what = three_cones()._replace(max_range=torch.tensor([False, True, False]))
-    rays = sample_rays(what, 300, seeded())
-    assert float(rays.weights[rays.is_hit].sum()) == pytest.approx(80)
-
-
 @pytest.mark.parametrize("covariance", [[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [0.0, 0.0]]])
 def test_a_flat_component_is_sampled_along_its_line(covariance):
     rays = sample_rays(one_cone((2.0, 3.0), covariance), 500, seeded())
