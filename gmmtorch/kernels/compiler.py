@@ -18,17 +18,18 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError
 
+A = TypeVar("A")
 logger = logging.getLogger(__name__)
 
 _TYPES = {
@@ -38,6 +39,7 @@ _TYPES = {
     "bool": ("bool", "?7x"),
 }
 """The type in Warp of a number in C++, and the format of `struct` that places it in eight bytes."""
+_CPP = {torch.float64: "double", torch.float32: "float", torch.int32: "int32_t"}
 _LEAST_ITEMS = 1 << 10  # of a thread of a CPU
 _BLOCK = 64
 """Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
@@ -247,6 +249,19 @@ class FusedKernel:
         stub = f"def body(item: wp.int64, {signature}): ...\n"
         entry = f"def {self.name}({signature}):\n    body(wp.int64(wp.tid()), {', '.join(names)})\n"
         return "\n".join([*casts, self._signature[1]]), stub, entry
+
+
+def templated(
+    source: str, name: str, arguments: Iterable[A], shares: bool = False, rounds_each: bool = False
+) -> dict[A, FusedKernel]:
+    """A kernel for each argument of a template: a number, a truth value, a type, or a tuple of these."""
+
+    def text(argument: object) -> str:
+        if isinstance(argument, tuple):
+            return ", ".join(map(text, argument))
+        return _CPP[argument] if isinstance(argument, torch.dtype) else str(argument).lower()
+
+    return {a: FusedKernel(source, f"{name}<{text(a)}>", shares, rounds_each) for a in arguments}
 
 
 class Team(NamedTuple):

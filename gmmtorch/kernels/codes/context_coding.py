@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
 MOST_STEPS = 2048
 """For each byte of a batch, to find the ranks of its origins; about 0.1 ms."""
 
-_CODINGS = {
-    (dim, writes): FusedKernel(
-        "codes/context_coding.h", f"context_coding<{dim}, {str(writes).lower()}>", rounds_each=True
-    )
-    for dim in (2, 3)
-    for writes in (True, False)
-}
+_KINDS = itertools.product((2, 3), (True, False))  # dimension, and whether the code is written
+_CODINGS = templated("codes/context_coding.h", "context_coding", _KINDS, rounds_each=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +75,7 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writ
     return int(result)
 
 
-_NUMBERS = {
-    writes: FusedKernel("codes/number_coding.h", f"number_coding<{str(writes).lower()}>", rounds_each=True)
-    for writes in (True, False)
-}
+_NUMBERS = templated("codes/number_coding.h", "number_coding", (True, False), rounds_each=True)
 
 
 def number_coding(

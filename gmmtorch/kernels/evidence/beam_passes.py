@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
 
 class PassLimits(NamedTuple):
@@ -33,7 +33,7 @@ class PassLimits(NamedTuple):
     explained: float
 
 
-_KERNELS = {dim: FusedKernel("evidence/beam_passes.h", f"beam_passes<{dim}>") for dim in (2, 3)}
+_KERNELS = templated("evidence/beam_passes.h", "beam_passes", (2, 3))
 
 
 def beam_passes(

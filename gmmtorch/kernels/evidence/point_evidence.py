@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.compiler import CPU_LANES, templated
 from gmmtorch.linalg import ragged_index
 
 _SQRT_HALF_PI = math.sqrt(math.pi / 2)
@@ -36,7 +36,7 @@ class PointTable(NamedTuple):
     tilts: Tensor
 
 
-_EVIDENCE = {dim: FusedKernel("evidence/point_evidence.h", f"point_evidence<{dim}>") for dim in (2, 3)}
+_EVIDENCE = templated("evidence/point_evidence.h", "point_evidence", (2, 3))
 
 
 def listed_evidence(
@@ -144,8 +144,8 @@ def sum_of(terms: Iterable[Tensor]) -> Tensor:
 
 
 _FEW_POINTS = "evidence/few_points.h"
-_NEAR_FEW = {dim: FusedKernel(_FEW_POINTS, f"few_points_near<{dim}>") for dim in (2, 3)}
-_OF_FEW = {dim: FusedKernel(_FEW_POINTS, f"few_points_evidence<{dim}>") for dim in (2, 3)}
+_NEAR_FEW = templated(_FEW_POINTS, "few_points_near", (2, 3))
+_OF_FEW = templated(_FEW_POINTS, "few_points_evidence", (2, 3))
 _VIEWS_AT_ONCE = 4096
 
 
@@ -179,7 +179,7 @@ def few_points_evidence(
     return found, counts.sum()
 
 
-_NEAR = {dim: FusedKernel("evidence/near_lists.h", f"near_lists<{dim}>") for dim in (2, 3)}
+_NEAR = templated("evidence/near_lists.h", "near_lists", (2, 3))
 _PARTS_OF_LISTS = 32  # of a list, on a device with many threads
 
 

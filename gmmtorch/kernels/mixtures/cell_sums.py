@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import FusedKernel, Team, templated
 
 KEY_BITS = 20
 """Bits of one cell coordinate in a key, as in `cells.h`."""
@@ -35,20 +35,12 @@ PATCH = 4
 
 _WIDTH = 10  # features in 3D
 _DISTINCT = FusedKernel("mixtures/cells.h", "distinct_keys", shares=True)
-_MOMENTS = {dim: FusedKernel("mixtures/cells.h", f"cell_moments<{dim}>", shares=True) for dim in (1, 2, 3)}
-_REAL = {torch.float32: "float", torch.float64: "double"}
-_DEPTHS = {
-    dtype: FusedKernel("mixtures/depth_cells.h", f"depth_cells<{real}>", shares=True)
-    for dtype, real in _REAL.items()
-}
-_RANGES = {
-    dtype: FusedKernel("mixtures/depth_cells.h", f"range_sums<{real}>") for dtype, real in _REAL.items()
-}
-_VALUES = {
-    dtype: FusedKernel("mixtures/cells.h", f"value_sums<{real}>", shares=True)
-    for dtype, real in _REAL.items()
-}
-_CURVE = {dim: FusedKernel("mixtures/cells.h", f"curve_keys<{dim}>", rounds_each=True) for dim in (1, 2, 3)}
+_MOMENTS = templated("mixtures/cells.h", "cell_moments", (1, 2, 3), shares=True)
+_REAL = torch.float32, torch.float64
+_DEPTHS = templated("mixtures/depth_cells.h", "depth_cells", _REAL, shares=True)
+_RANGES = templated("mixtures/depth_cells.h", "range_sums", _REAL)
+_VALUES = templated("mixtures/cells.h", "value_sums", _REAL, shares=True)
+_CURVE = templated("mixtures/cells.h", "curve_keys", (1, 2, 3), rounds_each=True)
 _MEANS = FusedKernel("mixtures/cells.h", "mean_features")
 _MOST_CELLS_ON_GPU = 1 << 18
 _FACTORS = np.array([2 ** (-step / 3) for step in range(3 * KEY_BITS + 7)])
@@ -312,10 +304,8 @@ def _features(x: Tensor) -> Tensor:
 
 DIMENSIONS = (1, 2, 3)
 
-_CUTS = {dim: FusedKernel("mixtures/piece_cuts.h", f"piece_cuts<{dim}>", shares=True) for dim in DIMENSIONS}
-_TEAM_CUTS = {
-    dim: FusedKernel("mixtures/piece_cuts.h", f"team_cuts<{dim}>", shares=True) for dim in DIMENSIONS
-}
+_CUTS = templated("mixtures/piece_cuts.h", "piece_cuts", DIMENSIONS, shares=True)
+_TEAM_CUTS = templated("mixtures/piece_cuts.h", "team_cuts", DIMENSIONS, shares=True)
 _MOST_ON_GPU = 1 << 12  # pieces: each is compared with all others
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, Team
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, Team, templated
 from gmmtorch.kernels.mixtures.em_steps import DIMENSIONS, Mixture, is_m_step_fused, lists_near_components
 
 MERGED = 256
@@ -29,14 +29,9 @@ _RUNNING, _ENDED, _IMPOSSIBLE, _PAUSED = range(4)  # states, as in `em_loops.h`
 _DECIDE = 14  # a phase of truncated EM, as there
 _PROGRESS = 16  # numbers of the progress of a run
 _HEAD = 2 * _PROGRESS
-_EXACT = {
-    (dim, wide): FusedKernel("mixtures/em_loops.h", f"exact_em<{dim}, {str(wide).lower()}>")
-    for dim, wide in itertools.product(DIMENSIONS, (False, True))
-}
-_TRUNCATED = {
-    (dim, wide): FusedKernel("mixtures/em_loops.h", f"truncated_em<{dim}, {str(wide).lower()}>")
-    for dim, wide in itertools.product(DIMENSIONS, (False, True))
-}
+_FORMS = list(itertools.product(DIMENSIONS, (False, True)))  # the last: for a CPU, whose rows are in lanes
+_EXACT = templated("mixtures/em_loops.h", "exact_em", _FORMS)
+_TRUNCATED = templated("mixtures/em_loops.h", "truncated_em", _FORMS)
 _SAMPLES = 64  # most rows of a group that are compared with all components
 _SORTED_PARTS, _MOST_COUNTS = 512, 1 << 22
 

@@ -17,12 +17,14 @@ number of its covariance.
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, squad_size
+from gmmtorch.kernels.compiler import CPU_LANES, squad_size, templated
 from gmmtorch.linalg import order_along_curve
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
@@ -35,15 +37,11 @@ _SQUAD_SUMS = 1 << 24  # most numbers of these sums, 128 MB
 
 _WIDTHS = {1: 3, 2: 6, 3: 10}
 _E_STEP = "mixtures/exact_e_step.h"
-_TABLES = {dim: FusedKernel("mixtures/near_components.h", f"component_table<{dim}>") for dim in _WIDTHS}
-_EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
-_MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
-_KINDS = {torch.float32: "float", torch.float64: "double"}
-_IN_BLOCKS = {
-    (dim, dtype): FusedKernel(_E_STEP, f"e_step_in_blocks<{dim}, {kind}>")
-    for dim in _WIDTHS
-    for dtype, kind in _KINDS.items()
-}
+_TABLES = templated("mixtures/near_components.h", "component_table", _WIDTHS)
+_EXPECTATION = templated(_E_STEP, "e_step", _WIDTHS)
+_MOST_LIKELY = templated(_E_STEP, "most_likely", _WIDTHS)
+_TYPES = itertools.product(_WIDTHS, (torch.float32, torch.float64))
+_IN_BLOCKS = templated(_E_STEP, "e_step_in_blocks", _TYPES)
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -224,11 +222,9 @@ def exponent_floor(dtype: torch.dtype) -> float:
 
 DIMENSIONS: tuple[int, ...] = (1, 2, 3)
 
-_NATURALS = {dim: FusedKernel("mixtures/m_step.h", f"natural_parameters<{dim}>") for dim in DIMENSIONS}
-_STEPS = {dim: FusedKernel("mixtures/m_step.h", f"m_step<{dim}>") for dim in DIMENSIONS}
-_LABELLED = {
-    dim: FusedKernel("mixtures/m_step.h", f"label_moments<{dim}>", shares=True) for dim in DIMENSIONS
-}
+_NATURALS = templated("mixtures/m_step.h", "natural_parameters", DIMENSIONS)
+_STEPS = templated("mixtures/m_step.h", "m_step", DIMENSIONS)
+_LABELLED = templated("mixtures/m_step.h", "label_moments", DIMENSIONS, shares=True)
 
 Mixture = tuple[Tensor, Tensor, Tensor]
 """Weights (K,), means (K, D) and covariances (K, D, D)."""

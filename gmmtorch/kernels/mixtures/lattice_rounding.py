@@ -11,14 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
-DIMENSIONS = (2, 3)
-
-_ROUNDINGS, _RESTORINGS = (
-    {dim: FusedKernel("mixtures/lattice.h", f"{name}<{dim}>", rounds_each=True) for dim in DIMENSIONS}
-    for name in ("lattice_rounding", "lattice_restoring")
-)
+_ROUNDINGS = templated("mixtures/lattice.h", "lattice_rounding", (2, 3), rounds_each=True)
+_RESTORINGS = templated("mixtures/lattice.h", "lattice_restoring", (2, 3), rounds_each=True)
 
 
 class LatticeConstants(NamedTuple):

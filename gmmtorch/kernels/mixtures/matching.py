@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import FusedKernel, Team, templated
 from gmmtorch.kernels.evidence.point_evidence import Lists
 
 _KEPT = 4  # motions of a result at most
@@ -23,7 +23,7 @@ _ROW = 32  # numbers of a component in the work space, and of a climb
 _CLIMB = 256
 _PARTS = 256  # of the components of the source on a GPU; each part has its own sums
 _MOST_PAIRS = 1 << 26
-_REGISTRATIONS = {dim: FusedKernel("mixtures/registration.h", f"registration<{dim}>") for dim in (2, 3)}
+_REGISTRATIONS = templated("mixtures/registration.h", "registration", (2, 3))
 
 
 class Registered(NamedTuple):
@@ -105,8 +105,8 @@ def fused_registration(
 
 _AT_ONCE = 256  # motions, whose scores the twin computes
 _PARTS_OF_POINTS = 64  # of a motion on a GPU; each part has its own sums
-_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"alignment<{dim}>") for dim in (2, 3)}
-_SCORES = {dim: FusedKernel("mixtures/point_alignment.h", f"point_scores<{dim}>") for dim in (2, 3)}
+_ALIGNMENTS = templated("mixtures/point_alignment.h", "alignment", (2, 3))
+_SCORES = templated("mixtures/point_alignment.h", "point_scores", (2, 3))
 
 
 class NearLists(NamedTuple):
@@ -133,7 +133,7 @@ class NearLists(NamedTuple):
 
 
 _STRIPS = 16  # of the cells of each first coordinate on a GPU, which one worker fills
-_BOXES = {dim: FusedKernel("mixtures/point_alignment.h", f"box_lists<{dim}>") for dim in (2, 3)}
+_BOXES = templated("mixtures/point_alignment.h", "box_lists", (2, 3))
 
 
 def fused_box_lists(first: Tensor, last: Tensor, sizes: list[int], n_entries: int) -> Lists:
@@ -341,9 +341,7 @@ def _arms(lever: Tensor) -> Tensor:
     return torch.stack(columns, 2)
 
 
-_EXPLAINED = {
-    dim: FusedKernel("mixtures/explained_points.h", f"explained_points<{dim}>", shares=True) for dim in (2, 3)
-}
+_EXPLAINED = templated("mixtures/explained_points.h", "explained_points", (2, 3), shares=True)
 
 
 def explained_points(

@@ -12,12 +12,9 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import Team, templated
 
-_MERGES = {
-    dim: FusedKernel("mixtures/pair_merges.h", f"pair_merges<{dim}>", shares=True, rounds_each=True)
-    for dim in range(2, 7)  # with attributes up to three more than those of space
-}
+_MERGES = templated("mixtures/pair_merges.h", "pair_merges", range(2, 7), shares=True, rounds_each=True)
 SELECTION_COUNTS = 16 * 256
 """Counts by which a team finds the smallest numbers, as in `selection.h`."""
 
@@ -62,10 +59,7 @@ def pair_merges(
     return None if bool(failed) else (lead, members, made)
 
 
-_CHOICES = {
-    dim: FusedKernel("mixtures/viewpoint_choice.h", f"viewpoint_choice<{dim}>", shares=True, rounds_each=True)
-    for dim in (2, 3)
-}
+_CHOICES = templated("mixtures/viewpoint_choice.h", "viewpoint_choice", (2, 3), shares=True, rounds_each=True)
 
 
 def viewpoint_choice(

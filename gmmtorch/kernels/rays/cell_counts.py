@@ -151,22 +151,15 @@ def _batched_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
     return torch.where(inside, torch.where(first < 0, -1, first + place), 0)
 
 
-class Removed(NamedTuple):
-    """Bits removed from all cells and from the chosen ones; chosen cells without evidence before."""
-
-    bits: float
-    chosen_bits: float
-    n_new: int
-
-
 _REMOVED = FusedKernel("rays/cell_entropy.h", "entropy_removed")
 _ALONG = FusedKernel("rays/cell_entropy.h", "reduction_along_rays")
 
 
 def entropy_removed(
     before: tuple[Tensor, Tensor], added: tuple[Tensor, Tensor], chosen: Tensor, prior: float, clamp: float
-) -> Removed:
-    """Sums, over cells, of the entropy that an addition of evidence removes.
+) -> tuple[float, float, int]:
+    """Bits of entropy that an addition of evidence removes from all cells and from the chosen ones; and how
+    many of the chosen ones had no evidence.
 
     Args:
         before, added: hits (C,) and misses (C,), float32. chosen: (C,) bool.
@@ -179,18 +172,15 @@ def entropy_removed(
         sums = torch.empty(-(-n // _RUN), 3, dtype=torch.float64, device=chosen.device)
         _REMOVED(len(sums), n, _RUN, *before, *added, chosen, prior, clamp, sums)
         bits, chosen_bits, n_new = sums.sum(0).tolist()
-        return Removed(bits, chosen_bits, int(n_new))
+        return bits, chosen_bits, int(n_new)
     (h, m), (more_h, more_m) = before, added
 
     def entropy(hits: Tensor, misses: Tensor) -> Tensor:
         return bernoulli_entropy(occupancy_probability(hits, misses, prior).clamp(clamp, 1 - clamp))
 
     gone = entropy(h, m) - entropy(h + more_h, m + more_m)
-    return Removed(
-        float(gone.sum(dtype=torch.float64)),
-        float(gone[chosen].sum(dtype=torch.float64)),
-        int((h + m == 0)[chosen].sum()),
-    )
+    bits, chosen_bits = (float(part.sum(dtype=torch.float64)) for part in (gone, gone[chosen]))
+    return bits, chosen_bits, int((h + m == 0)[chosen].sum())
 
 
 def reduction_along_rays(

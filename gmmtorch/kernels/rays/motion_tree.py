@@ -84,28 +84,7 @@ _N_LINKS, _PARENT, _ACTION, _FIRST_NODE = 11, 0, 1, 7
 _N_VALUES, _RETURN, _METRES = 4, 2, 3
 
 
-class _Tables(NamedTuple):
-    """`MotionTree` of motion_tree.h."""
-
-    links: Tensor
-    values: Tensor
-    states: Tensor
-    ends: Tensor
-    after: Tensor
-    clear: Tensor
-    untried: Tensor
-    residuals: Tensor
-    opened: Tensor
-    counts: Tensor
-    scale: Tensor
-    n_actions: int
-    n_blocks: int
-    deepest: int
-    exploration: float
-    widening: float
-    discount: float
-    weight: float
-    aims: float
+_RULE = "deepest", "exploration", "widening", "discount", "weight", "aims"
 
 
 class MotionTree:
@@ -114,7 +93,7 @@ class MotionTree:
     Args:
         state: (7,) of the root. ends: (P, 7) of the motions from it. clear: (P,) bool, which are safe.
         residual: (G,) of the root. metres: from it to the goal.
-        rule: the other fields of the structure in motion_tree.h, from `deepest` on.
+        rule: the last fields of the structure in motion_tree.h.
 
     Attributes:
         n_nodes, n_opened: nodes, and how many of them were opened last.
@@ -132,28 +111,24 @@ class MotionTree:
         **rule: Any,
     ) -> None:
         n, n_blocks = len(ends), len(residual)
-        self._tables = tables = _Tables(
-            links=torch.zeros(most, _N_LINKS, dtype=torch.int64),
-            values=torch.zeros(most, _N_VALUES, dtype=torch.float64),
-            states=state.expand(most, 7).contiguous(),
-            ends=torch.empty(most, n, 7, dtype=torch.float64),
-            after=torch.empty(most, n, dtype=torch.float64),
-            clear=torch.empty(most, n, dtype=torch.bool),
-            untried=torch.empty(most, n, dtype=torch.int32),
-            residuals=residual.expand(most, -1).contiguous(),
-            opened=torch.zeros(most, dtype=torch.int64),
-            counts=torch.ones(2, dtype=torch.int64),
-            scale=torch.full((1,), 1e-12, dtype=torch.float64),
-            n_actions=n,
-            n_blocks=n_blocks,
-            **rule,
-        )
-        self.states = tables.states
-        self._links, self._values = tables.links.numpy(), tables.values.numpy()
-        self._counts = tables.counts.numpy()
+        links = torch.zeros(most, _N_LINKS, dtype=torch.int64)
+        values = torch.zeros(most, _N_VALUES, dtype=torch.float64)
+        self.states = state.expand(most, 7).contiguous()
+        self._ends = torch.empty(most, n, 7, dtype=torch.float64)
+        after = torch.empty(most, n, dtype=torch.float64)
+        is_clear = torch.empty(most, n, dtype=torch.bool)
+        untried = torch.empty(most, n, dtype=torch.int32)
+        residuals = residual.expand(most, -1).contiguous()
+        self._opened = torch.zeros(most, dtype=torch.int64)
+        counts = torch.ones(2, dtype=torch.int64)
+        scale = torch.full((1,), 1e-12, dtype=torch.float64)
+        self._links, self._values, self._counts = links.numpy(), values.numpy(), counts.numpy()
         self._links[0, [_PARENT, _ACTION]] = self._links[0, _FIRST_NODE:] = -1
         self._values[0, _METRES] = metres
-        tables.ends[0], tables.clear[0] = ends, clear
+        self._ends[0], is_clear[0] = ends, clear
+        # `MotionTree` of motion_tree.h
+        tables = links, values, self.states, self._ends, after, is_clear, untried, residuals, self._opened
+        self._tables = *tables, counts, scale, n, n_blocks, *(rule[name] for name in _RULE)
 
     @property
     def n_nodes(self) -> int:
@@ -165,7 +140,7 @@ class MotionTree:
 
     def ends_opened(self) -> Tensor:
         """Ends (n, P, 7) of the motions from the nodes that were opened last."""
-        return self._tables.ends[self._tables.opened[: self.n_opened]]
+        return self._ends[self._opened[: self.n_opened]]
 
     def choose(self, orders: Tensor, most: int, turn: int, action: int = -1) -> int:
         """The number of new leaves in round `turn`, at most `most`. orders: (n, P), of the motions from the
@@ -190,8 +165,7 @@ class MotionTree:
         spacing: metres between checked points. views: the row (n,) of each node's view in the tables of gains
         (V, G) and of what is left (V, G).
         """
-        state = *self._tables, *library, *space
-        _OPEN(1, *state, longest, spacing, n, is_last, *views)
+        _OPEN(1, *self._tables, *library, *space, longest, spacing, n, is_last, *views)
 
     def best(self) -> tuple[list[int], list[int], float, float, float] | None:
         """Nodes and motions of the branch to the node with the largest return, the return, its information,

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
-_VIEWS = {dim: FusedKernel("rays/range_views.h", f"range_views<{dim}>") for dim in (2, 3)}
+_VIEWS = templated("rays/range_views.h", "range_views", (2, 3))
 
 
 def range_views(

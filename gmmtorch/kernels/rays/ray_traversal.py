@@ -27,7 +27,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunked
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, templated
 
 _SOURCE = "rays/ray_counting.h"
 TIE = 1e-13
@@ -285,17 +285,11 @@ def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:
     return [0, *cuts.tolist(), visits.shape[0]]
 
 
-_IN_GRID = {
-    dtype: FusedKernel(_SOURCE, f"count_rays_in_grid<{kind}>", shares=True)
-    for dtype, kind in ((torch.float64, "double"), (torch.int32, "int32_t"))
-}
+_IN_GRID = templated(_SOURCE, "count_rays_in_grid", (torch.float64, torch.int32), shares=True)
 _CELLS_A_RAY = 16
 """For more rays than a grid has cells / 16, a GPU counts in whole numbers of half the size, which fit better
 into its cache, and adds these to the counts."""
-_IN_BLOCKS = {
-    dtype: FusedKernel(_SOURCE, f"count_rays_in_blocks<{kind}>", shares=True)
-    for dtype, kind in ((torch.float64, "double"), (torch.float32, "float"))
-}
+_IN_BLOCKS = templated(_SOURCE, "count_rays_in_blocks", (torch.float64, torch.float32), shares=True)
 _MARK = FusedKernel(_SOURCE, "mark_rays")
 _MARK_BITS = FusedKernel(_SOURCE, "mark_cells_of_rays")
 
