@@ -1,7 +1,6 @@
 """Beams of one sensor that pass through components, and that end on them, for forgetting.
 
-The fused kernel handles one component in one item, and keeps no list of pairs. It counts as its twin does,
-unless a beam is within rounding of a limit.
+The fused kernel handles one component in one item, and keeps no list of pairs.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 lists of the cones whose hulls can give evidence near a place, see `occupancy.cone_index`.
 
 The fused kernel walks the list of cones of each point, tests whether the point is within the cutoff, and
-evaluates those that are. Its twin evaluates blocks of points. Their evidence differs by at most 10⁻¹² of the
-count of a cone, for each cone.
+evaluates those that are. Its twin evaluates blocks of points.
 """
 
 from __future__ import annotations

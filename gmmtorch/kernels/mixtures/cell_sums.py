@@ -2,16 +2,13 @@
 cells.
 
 The twins of `cell_moments` and `piece_cuts` are in `mixture.em.partition`, that of `distinct_keys` in
-`gmmtorch.linalg`, whose fused kernel runs on the CPU. Cells and their numbers equal the twin's; sums differ
-by rounding. Pieces are cut for all levels in one launch. They are those of the twin, except where a decision
-depends on rounding: a point within rounding of a cut, or two directions of equal extent.
+`gmmtorch.linalg`, whose fused kernel runs on the CPU. Pieces are cut for all levels in one launch.
 
 A pixel (u, v) of depth z sees the point z (a + u b + v c) + t. All moments of a patch of 4 × 4 pixels are
 therefore sums of z and z², multiplied by u, v and their products. A patch that is smaller than a cell, across
 the view and in depth, is added to the cell that contains its mean. The pixels of any other patch are added
 one by one. The points themselves are never stored. One launch passes over all images: in one item on a CPU;
-on CUDA each patch is an item. Its cells are those of the twin, except for patches and points within rounding
-of the side of a cell.
+on CUDA each patch is an item.
 """
 
 from __future__ import annotations

@@ -10,9 +10,8 @@ With float32 exponentials a GPU computes in float32 within a block, from differe
 axes, whose rounding errors have a bound. If it can exceed 2⁻¹⁰ nats for a log-density, with thin components
 and rows far apart, or with cells rather than points, the block is computed in float64.
 
-The twins of the M-step (2.4)-(2.6) and of natural parameters are in `mixture.em`. The M-step differs from its
-twin by at most 10⁻¹² of the largest entry of a component, and natural parameters by this times the condition
-number of its covariance.
+The twins of the M-step (2.4)-(2.6) and of natural parameters are in `mixture.em`; docs/occupancy.md tells the
+differences.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Mixtures registered with mixtures, scans aligned with components or laid over a raster, explained points.
 
 The twin of `fused_registration` is in `localization.registration`, and that of `explained_points` in
-`mapping.learning.novelty`. The kernels differ from their twins by rounding: sums of alignment by at most
-10⁻¹¹ of their largest entry.
+`mapping.learning.novelty`.
 """
 
 from __future__ import annotations
@@ -264,8 +263,6 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
     Args:
         cells: (H, N, 3) int64, of N points under each of H headings. heading: (C,) int64, and shift: (C, 3)
             int64, of each placement. raster: (nx, ny, nz) float32. outside: value of cells outside it.
-
-    The fused kernel differs from its twin by rounding.
     """
     if is_fused(cells, heading, shift, raster):
         return fused_bounds(cells, heading, shift, raster, outside, _NO_PRIOR)
@@ -363,8 +360,6 @@ def explained_points(
         means: (K, D), whitening: (K, D, D), lower triangular, float64; see `occupancy.cones.whitening`.
         near: (K,) bool, frees: (N,) bool: components that are not near explain no point that frees space.
             frees=None: no point does.
-
-    The fused kernel differs from its twin by rounding.
     """
     k, dim = means.shape
     table = torch.cat([means.T, whitening.flatten(1).T])

@@ -1,8 +1,7 @@
 """Mixtures reduced in rounds of merges, as in `mixture.reduction`; and the choice of the viewpoints that
 components keep, as in `mapping.learning.merging`.
 
-One launch does all rounds. Its merges equal the twin's to the bit, if the same pairs are merged; costs differ
-by rounding.
+One launch does all rounds.
 """
 
 from __future__ import annotations

@@ -66,8 +66,6 @@ def information_by_block(
         cameras: (V, 3) int64, the cells of the cameras; a camera outside sees nothing.
         yaw: (V,) int64, the headings.
         shannon_information: Shannon information (FSMI) instead of CSQMI.
-
-    The fused kernel differs from its twin by at most 10⁻⁴ of the largest gain of a view.
     """
     if is_fused(cells.occupancy, beams.volumes, cameras, yaw):
         return _fused(beams, cells, cameras, yaw, shannon_information)

@@ -1,6 +1,5 @@
 """Cells of dense blocks and of sparse stores: listed with their counts, found, and added to; and their
-entropy:
-what additions of evidence remove from it, and what one beam would remove.
+entropy: what additions of evidence remove from it, and what one beam would remove.
 """
 
 from __future__ import annotations
@@ -64,8 +63,6 @@ def add_counts(counts: Tensor, index: Tensor, hits: Tensor, misses: Tensor) -> t
 
     Args:
         counts: contiguous, changed in place. index: (C,) int64, flat in counts[0]; nothing is added at 0.
-
-    The fused kernel, for float32, and its twin give equal counts.
     """
     n = len(index)
     if is_fused(counts, index, hits, misses) and counts.dtype == hits.dtype == misses.dtype == torch.float32:
@@ -113,10 +110,7 @@ class BlockKeys(NamedTuple):
 
 
 def cell_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
-    """Flat index (C,) int64 of cells (C, D) in the slots; −1 in blocks that are not stored, 0 out of bounds.
-
-    The fused kernel and its twin give equal indices.
-    """
+    """Flat index (C,), int64, of cells (C, D) in the slots; −1 in blocks not stored, 0 out of bounds."""
     if is_fused(cells, blocks.keys, blocks.bounds):
         run = _INDEX_RUN if cells.device.type == "cpu" else 1
         index, (n, dim) = torch.empty_like(cells[:, 0]), cells.shape
@@ -164,8 +158,6 @@ def entropy_removed(
     Args:
         before, added: hits (C,) and misses (C,), float32. chosen: (C,) bool.
         prior: N_p, rays. clamp: probabilities stay within [clamp, 1 − clamp].
-
-    The fused kernel differs from its twin by at most 10⁻⁶ bits for each cell.
     """
     if is_fused(*before, *added, chosen) and before[0].dtype == torch.float32:
         n = len(chosen)

@@ -388,9 +388,7 @@ class SparseEvidence(SparseLattice):
         counts = self.counts.index_select(1, slots).view(2, *map(len, axes), *[side] * dim)
         interleaved = [axis for a in range(1, dim + 1) for axis in (a, a + dim)]
         counts = counts.permute(0, *interleaved).reshape(2, *(side * len(axis) for axis in axes))
-        offset = (box.low & (side - 1)).tolist()
-        part = tuple(slice(a, a + n) for a, n in zip(offset, shape, strict=True))
-        hits, misses = counts[(slice(None), *part)].contiguous()
+        hits, misses = counts[(slice(None), *box.slices(box.low & -side))].contiguous()
         return hits, misses
 
     def cells(self) -> CellEvidence:
