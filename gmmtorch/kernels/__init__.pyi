@@ -87,7 +87,6 @@ from .rays.cell_counts import list_counted_cells as list_counted_cells
 from .rays.cell_counts import occupancy_probability as occupancy_probability
 from .rays.cell_counts import reduction_along_rays as reduction_along_rays
 from .rays.component_casting import THINNING as THINNING
-from .rays.component_casting import Seen as Seen
 from .rays.component_casting import cast_components as cast_components
 from .rays.component_casting import hidden_area as hidden_area
 from .rays.component_casting import truncated_normals as truncated_normals

@@ -36,12 +36,7 @@ _KERNELS = templated("evidence/beam_passes.h", "beam_passes", (2, 3))
 
 
 def beam_passes(
-    whitening: Tensor,
-    offsets: Tensor,
-    deviations: Tensor,
-    beams: Tensor,
-    is_hit: Tensor,
-    limits: PassLimits,
+    whitening: Tensor, offsets: Tensor, deviations: Tensor, beams: Tensor, is_hit: Tensor, limits: PassLimits
 ) -> tuple[Tensor, Tensor]:
     """Number of beams (K,) that pass through each component, and number of returns (K,) on it, float64.
 

@@ -65,13 +65,7 @@ def listed_evidence(
 
 
 def pair_evidence(
-    points: Tensor,
-    block: Tensor,
-    rows: Tensor,
-    tilts: Tensor,
-    cone: Tensor,
-    resolution: float,
-    cutoff: float,
+    points: Tensor, block: Tensor, rows: Tensor, tilts: Tensor, cone: Tensor, resolution: float, cutoff: float
 ) -> tuple[Tensor, Tensor]:
     """Hits and misses (B, R) of R pairs of a block (R,) of points (D, B, b) and a cone (R,) of a table."""
     dim = points.shape[0]

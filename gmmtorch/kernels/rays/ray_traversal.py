@@ -183,10 +183,19 @@ def traverse(
         return
     starts, ends = starts.double(), ends.double()
     strides = strides or row_major_strides(shape)
-    if is_fused(starts, ends, low):
-        yield from _fused(starts, ends, shape, chunk_visits, strides, low)
-    else:
+    if not is_fused(starts, ends, low):
         yield from _batched(starts, ends, shape, chunk_visits, strides, low)
+        return
+    rays, device = rays_argument(starts, ends, shape, strides, low), starts.device
+    counts = torch.empty(len(starts), dtype=torch.int64, device=device)
+    _COUNT_VISITS(len(starts), *rays, counts)
+    stops = torch.cumsum(counts, 0)
+    cuts = _chunk_bounds(counts, chunk_visits)
+    sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
+    for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
+        if after > before:
+            listed = functools.partial(_listed, rays, stops, {begin: before, stop: after}, begin)
+            yield from chunked(stop - begin, stop - begin, listed)
 
 
 def rays_argument(
@@ -206,27 +215,6 @@ def rays_argument(
 
 _COUNT_VISITS = FusedKernel(_SOURCE, "count_visits")
 _LIST_VISITS = FusedKernel(_SOURCE, "list_visits")
-
-
-def _fused(
-    starts: Tensor,
-    ends: Tensor,
-    shape: tuple[int, ...],
-    chunk_visits: int,
-    strides: list[int],
-    low: Tensor | None,
-) -> Iterator[Visits]:
-    device = starts.device
-    rays = rays_argument(starts, ends, shape, strides, low)
-    counts = torch.empty(starts.shape[0], dtype=torch.int64, device=device)
-    _COUNT_VISITS(starts.shape[0], *rays, counts)
-    stops = torch.cumsum(counts, 0)
-    cuts = _chunk_bounds(counts, chunk_visits)
-    sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
-    for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
-        if after > before:
-            listed = functools.partial(_listed, rays, stops, {begin: before, stop: after}, begin)
-            yield from chunked(stop - begin, stop - begin, listed)
 
 
 def _listed(
@@ -263,13 +251,7 @@ def _batched(
 
 
 def _crossings_of(
-    rays: _Rays,
-    begin: int,
-    shape: tuple[int, ...],
-    strides: list[int],
-    axis: int,
-    masked: bool,
-    part: slice,
+    rays: _Rays, begin: int, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool, part: slice
 ) -> Visits:
     """`_crossings` of a run of rays that starts at `begin`."""
     first, last = begin + part.start, begin + part.stop
@@ -342,11 +324,7 @@ class BlockTable(NamedTuple):
 
 
 def count_in_blocks(
-    counts: Callable[[], Tensor],
-    table: BlockTable,
-    starts: Tensor,
-    ends: Tensor,
-    weights: Tensor | None,
+    counts: Callable[[], Tensor], table: BlockTable, starts: Tensor, ends: Tensor, weights: Tensor | None
 ) -> None:
     """Add the weight of each ray at every voxel that it leaves; stores the blocks of these voxels.
 

@@ -79,10 +79,7 @@ class PointEvidence(NamedTuple):
 
 
 def point_evidence(
-    cones: Cones,
-    points: ArrayLike,
-    resolution: float,
-    cutoff: float = CUTOFF,
+    cones: Cones, points: ArrayLike, resolution: float, cutoff: float = CUTOFF
 ) -> PointEvidence:
     """Evidence of the cube of side `resolution` (m) centred at each point (M, D), world metres.
 

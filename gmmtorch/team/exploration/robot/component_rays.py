@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
-from gmmtorch.kernels import THINNING, Seen, cast_components, hidden_area, is_fused, truncated_normals
+from gmmtorch.kernels import THINNING, cast_components, hidden_area, is_fused, truncated_normals
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping import Components
 from gmmtorch.occupancy import (
@@ -235,7 +235,7 @@ def _fused(
         components.origins.double(),
         components.max_range,
         components.ids,
-        Seen(components.seen_by[seen], components.seen_from[seen], count),
+        (components.seen_by[seen], components.seen_from[seen], count),
         torch.stack([*box, *window]).double(),
         resolution=density.resolution,
         rays_per_cell=(density.rays_per_cell, of_empty.rays_per_cell),
