@@ -24,7 +24,6 @@ from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
 from gmmtorch.occupancy.protocol import check_queries
-from gmmtorch.occupancy.voxels.cells import Box, intersection
 
 
 class PointBlocks(NamedTuple):
@@ -308,7 +307,7 @@ class KeptEvidence:
         self.resolution = check_resolution(resolution)
         self._form: PointForm | None = None
         self._cones: Cones
-        self._box: Box
+        self._first: Tensor
         self._hits: Tensor
         self._misses: Tensor
         self.n_evaluated = 0
@@ -325,14 +324,12 @@ class KeptEvidence:
         cones = cones.checked()
         form, changed = self._next_form(cones, cutoff)
         first = self._first_cell(grid, cones.means.device)
-        box = Box(first, first + first.new_tensor(grid.shape))
         points = self.centers(grid, cones.means.device)
         hits, misses = torch.zeros(2, *grid.shape, dtype=torch.float64, device=points.device)
         is_asked = torch.ones(grid.shape, dtype=torch.bool, device=points.device)
         if self._form is not None:
-            if common := intersection(box, self._box):
-                new, old = common.slices(first), common.slices(self._box.low)
-                hits[new], misses[new], is_asked[new] = self._hits[old], self._misses[old], False
+            new, old = _overlap(first, grid.shape, self._first, self._hits.shape)
+            hits[new], misses[new], is_asked[new] = self._hits[old], self._misses[old], False
             index = ConeIndex(changed, self.resolution, cutoff, smoothed=True, smallest=True)
             is_asked |= (index.buckets(points) >= 0).view(grid.shape)
         asked = is_asked.flatten().nonzero().squeeze(1)
@@ -341,7 +338,7 @@ class KeptEvidence:
             values.view(-1)[asked] = new_values
         self.n_evaluated = len(asked)
         self._form, self._cones = form, cones
-        self._box, self._hits, self._misses = box, hits, misses
+        self._first, self._hits, self._misses = first, hits, misses
         return PointEvidence(hits, misses)
 
     def centers(self, grid: VoxelGrid, device: torch.device | None = None) -> Tensor:
@@ -371,6 +368,19 @@ class KeptEvidence:
         gone[former[former >= 0]] = False
         parts = zip(self._cones.taken(gone), cones.taken(former < 0), strict=True)
         return self._form.replaced(cones, former), Cones(*map(torch.cat, parts))
+
+
+def _overlap(
+    first: Tensor, shape: tuple[int, ...], other_first: Tensor, other_shape: tuple[int, ...]
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """The cells that two grids share, as slices of each, from the lowest cells and shapes of both."""
+    shift = (other_first - first).tolist()
+    mine, others = [], []
+    for offset, size, other_size in zip(shift, shape, other_shape, strict=True):
+        low, high = max(offset, 0), max(min(offset + other_size, size), max(offset, 0))
+        mine.append(slice(low, high))
+        others.append(slice(low - offset, high - offset))
+    return tuple(mine), tuple(others)
 
 
 _CHUNK_CELLS = 1 << 18

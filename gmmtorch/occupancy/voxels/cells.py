@@ -36,11 +36,6 @@ class Box(NamedTuple):
         """Cells along each axis."""
         return tuple((self.high - self.low).tolist())
 
-    def slices(self, first: Tensor) -> tuple[slice, ...]:
-        """These cells in an array that begins with the cell `first` (D,)."""
-        ends = zip((self.low - first).tolist(), (self.high - first).tolist(), strict=True)
-        return tuple(slice(*pair) for pair in ends)
-
 
 def intersection(one: Box, other: Box) -> Box | None:
     """The cells that are in both boxes; None if there are none."""

@@ -23,6 +23,7 @@ from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, contains, intersection
 
+_NOWHERE = 2.0**62  # a coordinate beyond all keys
 _LOCAL_BITS = {2: 4, 3: 3}  # bits of the position of a cell in its block, along each axis
 
 
@@ -466,13 +467,13 @@ class SparseEvidence(SparseLattice):
 
         Points can be NaN or infinite: they have no evidence.
         """
-        return self.at_cells(self.cells_of(as_tensor(points, "points", device=self.device)))
+        cells = self.cells_of(as_tensor(points, "points", device=self.device))
+        reachable = self.reachable(self.columns(cells))
+        return self.at_cells(torch.where(reachable[:, None], cells, _NOWHERE).long())
 
     def at_cells(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Hits (C,) and misses (C,) of cells (C, D); 0 without evidence."""
-        reachable = self.reachable(self.columns(cells))
-        index = self._index_of(torch.where(reachable[:, None], cells, 0).long()).clamp_min_(0)
-        index = torch.where(reachable, index, 0)
+        """Hits (C,) and misses (C,) of cells (C, D), int64; 0 without evidence."""
+        index = self._index_of(cells).clamp_min_(0)
         hits, misses = (counts.view(-1).index_select(0, index) for counts in self.counts)
         return hits, misses
 
@@ -499,7 +500,9 @@ class SparseEvidence(SparseLattice):
         counts = self.counts.index_select(1, slots).view(2, *map(len, axes), *[side] * dim)
         interleaved = [axis for a in range(1, dim + 1) for axis in (a, a + dim)]
         counts = counts.permute(0, *interleaved).reshape(2, *(side * len(axis) for axis in axes))
-        hits, misses = counts[(slice(None), *box.slices(box.low & -side))].contiguous()
+        offset = (box.low & (side - 1)).tolist()
+        part = tuple(slice(a, a + n) for a, n in zip(offset, shape, strict=True))
+        hits, misses = counts[(slice(None), *part)].contiguous()
         return hits, misses
 
     def cells(self) -> CellEvidence:
