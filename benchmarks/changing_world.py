@@ -118,8 +118,8 @@ def recorded(n_scans: int, seed: int) -> Recorded:
         reading = torch.where(hit, now, sensor.max_range)
         ends = origin + rays * (reading + noise)[:, None]
         scans.append(gt.Scan(ends[hit], origin, ends[~hit], time=seconds))
-        for visits in traverse((origin / CELL).expand(len(rays), 3), ends / CELL, SHAPE, low=LOW):
-            crossed[visits.voxel] = number
+        for voxel, _ in traverse((origin / CELL).expand(len(rays), 3), ends / CELL, SHAPE, low=LOW):
+            crossed[voxel] = number
         moving = hit & ((now - last).abs() > 0.05) & (now < last)
         seen[cells(origin + rays[moving] * now[moving, None])] = number
         if number >= n_scans:

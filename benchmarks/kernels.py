@@ -58,7 +58,7 @@ def ray_work(n: int, device: str) -> Iterator[Work]:
     for resolution in (0.2, 0.05):
         starts, ends, grid = rays(n, resolution, device)
         a, b = grid.to_units(starts), grid.to_units(ends)
-        visits = sum(chunk.voxel.numel() for chunk in traverse(a, b, grid.shape))
+        visits = sum(voxel.numel() for voxel, _ in traverse(a, b, grid.shape))
 
         def list_visits(a: Tensor = a, b: Tensor = b, grid: VoxelGrid = grid) -> None:
             for _ in traverse(a, b, grid.shape):

@@ -119,7 +119,8 @@ def run_as_on_gpu(kernel: FusedKernel, n_items: int, *arguments: Tensor | float 
     """Launch a kernel as `kernel(n_items, ...)` would on a GPU."""
     if n_items == 0:
         return
-    block = ctypes.create_string_buffer(kernel._packed.pack(*kernel._values(arguments)))
+    values, _tensors = kernel._values(arguments)
+    block = ctypes.create_string_buffer(kernel._packed.pack(*values))
     is_team = any(parameter.label == "arrived" for parameter in kernel._parameters)
     n_threads = n_items if is_team else min(N_THREADS, n_items)
     has_squads = not is_team and "squad_of(item)" in kernel._text and n_items % _BLOCK == 0
@@ -127,12 +128,12 @@ def run_as_on_gpu(kernel: FusedKernel, n_items: int, *arguments: Tensor | float 
     _compiled(kernel)(ctypes.c_int64(n_items), ctypes.c_int64(n_threads), has_squads, block)
 
 
-def _launch(self: FusedKernel, n_items: int, *arguments: Any, device: torch.device) -> None:
-    for argument in arguments:
-        if isinstance(argument, Tensor) and argument.device.type != device.type:
-            raise AssertionError(f"{self.name} runs on {device} and gets a tensor of {argument.device}")
-    if device.type == "cpu":
-        _launch_on_cpu(self, n_items, *arguments, device=device)
+def _launch(self: FusedKernel, n_items: int, *arguments: Any) -> None:
+    devices = {argument.device.type for argument in arguments if isinstance(argument, Tensor)}
+    if len(devices) > 1:
+        raise AssertionError(f"{self.name} gets tensors of {' and '.join(sorted(devices))}")
+    if devices == {"cpu"}:
+        _launch_on_cpu(self, n_items, *arguments)
         return
     run_as_on_gpu(self, n_items, *arguments)
 

@@ -18,17 +18,18 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError
 
+A = TypeVar("A")
 logger = logging.getLogger(__name__)
 
 _TYPES = {
@@ -38,6 +39,7 @@ _TYPES = {
     "bool": ("bool", "?7x"),
 }
 """The type in Warp of a number in C++, and the format of `struct` that places it in eight bytes."""
+_CPP = {torch.float64: "double", torch.float32: "float", torch.int32: "int32_t"}
 _LEAST_ITEMS = 1 << 10  # of a thread of a CPU
 _BLOCK = 64
 """Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
@@ -45,6 +47,7 @@ spread over all multiprocessors."""
 _BLOCKS_OF_TEAM = 4
 """Blocks of a team on each multiprocessor. So many are there at a time with 255 registers a thread, so none
 waits for a block that has not begun."""
+_CPU = torch.device("cpu")
 _lock = threading.RLock()
 
 CPU_LANES = 8
@@ -65,13 +68,7 @@ class FusedKernel:
             a * b + c. Results of such a kernel can equal those of tensor operations to the bit.
     """
 
-    def __init__(
-        self,
-        source: str,
-        call: str,
-        shares: bool = False,
-        rounds_each: bool = False,
-    ) -> None:
+    def __init__(self, source: str, call: str, shares: bool = False, rounds_each: bool = False) -> None:
         self.name = re.sub(r"\W+", "_", call).strip("_")
         self.shares, self._rounds_each = shares, rounds_each
         self._source, self._call = (Path(__file__).parent / source).resolve(), call
@@ -79,36 +76,52 @@ class FusedKernel:
         self._loaded: set[torch.device] = set()
         self._threads = threading.local()
 
-    def __call__(self, n_items: int, *arguments: Tensor | float | None, device: torch.device) -> None:
-        """Run the function for the items 0 … n_items − 1.
+    def __call__(self, n_items: int, *arguments: Tensor | float | None) -> None:
+        """Run the function for the items 0 … n_items − 1, on the device of the tensors.
 
-        Tensors must be on `device` and of the type of their pointers; this is not checked. Raises
-        `GmmTorchError` for a tensor that is not contiguous. On a CPU the items are split over
-        `torch.get_num_threads()` threads, unless the kernel `shares`.
+        Tensors must be on one device and of the type of their pointers; this is not checked. One that is not
+        contiguous is copied if the function only reads it, and raises `GmmTorchError` otherwise. On a CPU the
+        items are split over `torch.get_num_threads()` threads, unless the kernel `shares`.
         """
         if n_items == 0:
             return
-        values = self._values(arguments)
+        values, tensors = self._values(arguments)
+        device = tensors[0].device
         if device not in self._loaded:
             self.load(device)
         if device.type == "cuda":
-            self._cuda_launch_of_thread(device)(n_items, values)
+            launch = self._recorded(device)
+            for place, value in zip(launch.params[1:], values, strict=True):
+                place.value = value
+            launch.set_dim(n_items)
+            launch.launch(_warp_stream(torch.cuda.current_stream(device)))
             return
-        launch = self._launch_of_thread()
-        self._packed.pack_into(launch.block, 0, *values)
+        block = ctypes.create_string_buffer(self._packed.pack(*values))
         n_threads = 1 if self.shares else min(torch.get_num_threads(), 1 + n_items // _LEAST_ITEMS)
         if n_threads == 1:
-            launch(0, n_items, launch.block)
+            self._run(block, 0, n_items)
             return
         bounds = [n_items * part // n_threads for part in range(n_threads + 1)]
-        jobs = [
-            _threads(n_threads).submit(
-                lambda *part: self._launch_of_thread()(*part), begin, stop, launch.block
-            )
-            for begin, stop in itertools.pairwise(bounds)
-        ]
+        jobs = [_threads(n_threads).submit(self._run, block, *part) for part in itertools.pairwise(bounds)]
         for job in jobs:
             job.result()  # Warp releases the interpreter's lock during a launch
+
+    def _run(self, block: ctypes.Array[ctypes.c_char], begin: int, stop: int) -> None:
+        """Runs some items on a CPU, with the arguments in a block of memory."""
+        launch = self._recorded(_CPU)
+        launch.set_params_from_ctypes([begin, stop, ctypes.addressof(block)])
+        launch.launch()
+
+    def _recorded(self, device: torch.device) -> Any:
+        """The launch of this thread, which is repeated with other values: a new one takes much longer."""
+        launches: dict[torch.device, Any] = self._threads.__dict__.setdefault("launches", {})
+        if device not in launches:
+            kernel, how = self._kernels[device.type], {"device": str(device), "record_cmd": True}
+            if device.type == "cuda":
+                how |= {"block_dim": _BLOCK}
+            n_values = 3 if device.type == "cpu" else len(self._parameters)
+            launches[device] = _warp().launch(kernel, 1, inputs=[0] * n_values, **how)
+        return launches[device]
 
     @functools.cached_property
     def _text(self) -> str:
@@ -141,34 +154,25 @@ class FusedKernel:
     def _packed(self) -> struct.Struct:
         return struct.Struct("=" + "".join("Q" if p.pointer else _TYPES[p.cpp][1] for p in self._parameters))
 
-    def _values(self, arguments: tuple[Tensor | float | None, ...]) -> list[float]:
-        """What is passed for the arguments: the address of a tensor, 0 for None."""
+    def _values(self, arguments: tuple[Tensor | float | None, ...]) -> tuple[list[float], list[Tensor]]:
+        """Numbers, with the address for a tensor and 0 for None; and the tensors, which a launch needs."""
         values: list[float] = []
+        tensors = []
         for parameter, argument in zip(self._parameters, arguments, strict=True):
             if isinstance(argument, Tensor):
-                if not argument.is_contiguous():
-                    raise GmmTorchError(
-                        f"{parameter.label} of kernel {self.name} has shape {tuple(argument.shape)} and "
-                        f"strides {argument.stride()}, which are not contiguous; pass tensor.contiguous()."
-                    )
-                values.append(argument.data_ptr())
+                tensors.append(argument if argument.is_contiguous() else self._copied(parameter, argument))
+                values.append(tensors[-1].data_ptr())
             else:
                 values.append(0 if argument is None else argument)
-        return values
+        return values, tensors
 
-    def _launch_of_thread(self) -> _CpuLaunch:
-        """The launch of this thread, which is repeated with other values: a new one takes much longer."""
-        launch: _CpuLaunch | None = getattr(self._threads, "launch", None)
-        if launch is None:
-            launch = self._threads.launch = _CpuLaunch(self._kernels["cpu"], self._packed.size)
-        return launch
-
-    def _cuda_launch_of_thread(self, device: torch.device) -> _CudaLaunch:
-        """The launch of this thread on a GPU, which is repeated in the same way."""
-        launches: dict[torch.device, _CudaLaunch] = self._threads.__dict__.setdefault("on_gpu", {})
-        if device not in launches:
-            launches[device] = _CudaLaunch(self._kernels["cuda"], device, len(self._parameters))
-        return launches[device]
+    def _copied(self, parameter: _Parameter, tensor: Tensor) -> Tensor:
+        if parameter.cpp.startswith("const "):
+            return tensor.contiguous()
+        raise GmmTorchError(
+            f"{parameter.label} of kernel {self.name} has shape {tuple(tensor.shape)} and strides "
+            f"{tensor.stride()}, which are not contiguous; pass tensor.contiguous()."
+        )
 
     def load(self, device: torch.device) -> None:
         """Compile the kernel for a device, or load it from the cache; nothing if that is done.
@@ -247,6 +251,19 @@ class FusedKernel:
         return "\n".join([*casts, self._signature[1]]), stub, entry
 
 
+def templated(
+    source: str, name: str, arguments: Iterable[A], shares: bool = False, rounds_each: bool = False
+) -> dict[A, FusedKernel]:
+    """A kernel for each argument of a template: a number, a truth value, a type, or a tuple of these."""
+
+    def text(argument: object) -> str:
+        if isinstance(argument, tuple):
+            return ", ".join(map(text, argument))
+        return _CPP[argument] if isinstance(argument, torch.dtype) else str(argument).lower()
+
+    return {a: FusedKernel(source, f"{name}<{text(a)}>", shares, rounds_each) for a in arguments}
+
+
 class Team(NamedTuple):
     """The workers of a launch that wait for each other, in C++ `gmm::Team`; n is the size of the launch."""
 
@@ -304,45 +321,10 @@ def _declared(declarations: list[str], values: dict[str, str]) -> list[_Paramete
     return found
 
 
-class _CpuLaunch:
-    """A launch of a kernel on a CPU that can be repeated: (begin, stop, block of arguments).
-
-    Attributes:
-        block: memory for the arguments of one launch.
-    """
-
-    def __init__(self, kernel: Any, n_bytes: int) -> None:
-        self.block = ctypes.create_string_buffer(n_bytes)
-        values = [0, 0, ctypes.addressof(self.block)]
-        self._launch = _warp().launch(kernel, dim=1, inputs=values, device="cpu", record_cmd=True)
-
-    def __call__(self, begin: int, stop: int, block: ctypes.Array[ctypes.c_char]) -> None:
-        self._launch.set_params_from_ctypes([begin, stop, ctypes.addressof(block)])
-        self._launch.launch()
-
-
-class _CudaLaunch:
-    """A launch of a kernel on a GPU that can be repeated: (n_items, values of the arguments)."""
-
-    def __init__(self, kernel: Any, device: torch.device, n_values: int) -> None:
-        self._device = device
-        self._streams: dict[int, Any] = {}
-        self._launch = _warp().launch(
-            kernel, 1, inputs=[0] * n_values, device=str(device), block_dim=_BLOCK, record_cmd=True
-        )
-
-    def __call__(self, n_items: int, values: list[float]) -> None:
-        for place, value in zip(self._launch.params[1:], values, strict=True):
-            place.value = value
-        self._launch.set_dim(n_items)
-        self._launch.launch(self._current_stream())
-
-    def _current_stream(self) -> Any:
-        """The stream of torch, as Warp's: an object is made for each only once."""
-        stream = torch.cuda.current_stream(self._device)
-        if stream.cuda_stream not in self._streams:
-            self._streams[stream.cuda_stream] = _warp().stream_from_torch(stream)
-        return self._streams[stream.cuda_stream]
+@functools.cache
+def _warp_stream(stream: torch.cuda.Stream) -> Any:
+    """A stream of torch, as Warp's."""
+    return _warp().stream_from_torch(stream)
 
 
 @functools.cache
@@ -365,7 +347,6 @@ if hasattr(os, "register_at_fork"):
 
 
 _PROBE = FusedKernel("probe.h", "probe")
-_CPU = torch.device("cpu")
 
 
 @functools.cache
@@ -376,7 +357,7 @@ def compiler_failure(device: torch.device = _CPU) -> str | None:
     """
     value = torch.zeros(1, dtype=torch.int64, device=device)
     try:
-        _PROBE(1, value, device=device)
+        _PROBE(1, value)
     except GmmTorchError as error:
         return str(error)
     except Exception as error:  # Warp raises several types for a driver that it cannot use

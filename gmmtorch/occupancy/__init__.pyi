@@ -69,4 +69,4 @@ from .voxels.ray_casting import near_interval as near_interval
 from .voxels.ray_casting import rays_in_box as rays_in_box
 from .voxels.rolling_window import RollingWindow as RollingWindow
 from .voxels.sparse_evidence import SparseEvidence as SparseEvidence
-from .voxels.sparse_lattice import SparseLattice as SparseLattice
+from .voxels.sparse_evidence import SparseLattice as SparseLattice

@@ -324,15 +324,8 @@ class Reliability(NamedTuple):
     @property
     def expected_error(self) -> float:
         """Expected calibration error: mean |observed − predicted| over the points."""
-        return float(self._gap() @ self.n_points / self.n_points.sum())
-
-    @property
-    def maximum_error(self) -> float:
-        """Maximum calibration error: the largest |observed − predicted| of a bin."""
-        return float(self._gap().max())
-
-    def _gap(self) -> np.ndarray:
-        return np.abs(self.observed - self.predicted)
+        gap = np.abs(self.observed - self.predicted)
+        return float(gap @ self.n_points / self.n_points.sum())
 
 
 def reliability_of(tally: Tensor) -> Reliability:

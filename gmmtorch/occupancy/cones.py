@@ -252,44 +252,27 @@ def face_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> Iterator
     covariance = cones.covariances.detach().double() * (cutoff / grid.resolution) ** 2
     spread = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     below, above = torch.minimum(sensor, mean - spread), torch.maximum(sensor, mean + spread)
-    for axis in range(grid.dim):
-        yield _rows_of_axis(sensor, mean, covariance, (below, above), grid, axis)
-
-
-def _rows_of_axis(
-    sensor: Tensor,
-    mean: Tensor,
-    covariance: Tensor,
-    bounds: tuple[Tensor, Tensor],
-    grid: VoxelGrid,
-    axis: int,
-) -> FaceRows:
-    """Rows perpendicular to `axis`; sensor, mean, covariance times cutoff², and bounds, in cells."""
-    below, above = bounds
-    n = grid.shape[axis]
-    # Forward: planes 1 … n above the sensor origin, each the upper face of a cell; backward: 0 … n − 1.
-    begin = torch.stack([sensor[:, axis].floor() + 1, below[:, axis].floor() + 1])
-    stop = torch.stack([above[:, axis].ceil(), sensor[:, axis].ceil()])
-    begin = torch.stack([begin[0].clamp(1, n + 1), begin[1].clamp(0, n)]).long()
-    stop = torch.stack([stop[0].clamp(1, n + 1), stop[1].clamp(0, n)]).long()
-    planes = (stop - begin).clamp_min(0).flatten()
-    row, within = ragged_index(planes)
-    plane = within + begin.flatten()[row]
-    cone, forward = row % len(sensor), row < len(sensor)
-    height = plane - sensor[cone, axis]
-    first, count = [], []
-    for other in range(grid.dim):
-        if other == axis:
-            continue
-        slopes = _tangent_slopes(mean - sensor, covariance, axis, other)
-        ends = sensor[cone, other] + height * torch.stack(slopes)[:, cone]
-        low = torch.maximum(ends.amin(0), below[cone, other])
-        high = torch.minimum(ends.amax(0), above[cone, other])
-        size = grid.shape[other]
-        lowest = low.floor().clamp(0, size).long()
-        first.append(lowest)
-        count.append((high.ceil().clamp(0, size).long() - lowest).clamp_min(0))
-    return FaceRows(cone, plane, forward, torch.stack(first, 1), torch.stack(count, 1))
+    for axis, n in enumerate(grid.shape):
+        # Forward: planes 1 … n above the sensor origin, each the upper face of a cell; backward: 0 … n − 1.
+        begin = torch.stack([sensor[:, axis].floor() + 1, below[:, axis].floor() + 1])
+        stop = torch.stack([above[:, axis].ceil(), sensor[:, axis].ceil()])
+        begin, stop = (
+            torch.stack([ends[0].clamp(1, n + 1), ends[1].clamp(0, n)]).long() for ends in (begin, stop)
+        )
+        row, within = ragged_index((stop - begin).clamp_min(0).flatten())
+        plane = within + begin.flatten()[row]
+        cone, forward = row % len(sensor), row < len(sensor)
+        height = plane - sensor[cone, axis]
+        first, count = [], []
+        for other in (b for b in range(grid.dim) if b != axis):
+            slopes = _tangent_slopes(mean - sensor, covariance, axis, other)
+            ends = sensor[cone, other] + height * torch.stack(slopes)[:, cone]
+            low = torch.maximum(ends.amin(0), below[cone, other])
+            high = torch.minimum(ends.amax(0), above[cone, other])
+            lowest = low.floor().clamp(0, grid.shape[other]).long()
+            first.append(lowest)
+            count.append((high.ceil().clamp(0, grid.shape[other]).long() - lowest).clamp_min(0))
+        yield FaceRows(cone, plane, forward, torch.stack(first, 1), torch.stack(count, 1))
 
 
 def _tangent_slopes(toward: Tensor, scaled: Tensor, a: int, b: int) -> tuple[Tensor, Tensor]:
@@ -312,16 +295,11 @@ def _tangent_slopes(toward: Tensor, scaled: Tensor, a: int, b: int) -> tuple[Ten
     return low, high
 
 
-class BallRows(NamedTuple):
-    """Boxes of cells around R ellipsoids: cone (R,); lowest cell `first` and `number` of cells, (R, D)."""
+def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes of cells that ellipsoids can meet: cone (R,), lowest cell and number of cells (R, D) of each.
 
-    cone: Tensor
-    first: Tensor
-    number: Tensor
-
-
-def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> BallRows:
-    """Cells that the ellipsoid of each cone can meet; cones of no-return beams have none."""
+    Cones of no-return beams have none.
+    """
     cone = (~cones.max_range).nonzero().squeeze(1)
     mean = grid.to_units(cones.means[cone].detach())
     variance = cones.covariances[cone].detach().double().diagonal(dim1=-2, dim2=-1)
@@ -329,4 +307,4 @@ def ball_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> BallRows
     size = torch.tensor(grid.shape, dtype=torch.float64, device=mean.device)
     low = (mean - spread).floor().clamp(mean.new_zeros(()), size).long()
     high = (mean + spread).ceil().clamp(mean.new_zeros(()), size).long()
-    return BallRows(cone, low, high - low)
+    return cone, low, high - low

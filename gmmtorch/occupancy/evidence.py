@@ -15,8 +15,8 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.errors import check_prior as check_prior
-from gmmtorch.kernels import CHUNK_VISITS, chunk_elements, count_in_grid
 from gmmtorch.kernels import bernoulli_entropy as bernoulli_entropy
+from gmmtorch.kernels import chunk_elements, count_in_grid
 from gmmtorch.kernels import occupancy_probability as occupancy_probability
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.occupancy.grid import VoxelGrid
@@ -42,11 +42,6 @@ class CellClass(IntEnum):
     UNKNOWN = -1
     FREE = 0
     OCCUPIED = 1
-
-
-def bernoulli_variance(probability: Tensor) -> Tensor:
-    """θ(1 − θ): ¼ for an unknown cell, 0 for a certain cell."""
-    return probability * (1 - probability)
 
 
 def classify(probability: ArrayLike, variance_threshold: float) -> Tensor:
@@ -129,8 +124,9 @@ class Evidence:
         return self._theta(self.hits, self.misses, prior)
 
     def variance(self, prior: float | None = None) -> Tensor:
-        """θ(1 − θ) of each cell."""
-        return bernoulli_variance(self.probability(prior))
+        """θ(1 − θ) of each cell: ¼ for an unknown cell, 0 for a certain cell."""
+        theta = self.probability(prior)
+        return theta * (1 - theta)
 
     def entropy(self, prior: float | None = None) -> Tensor:
         """Entropy of each cell in bits."""
@@ -156,7 +152,6 @@ class Evidence:
         ends: ArrayLike,
         weights: ArrayLike | None = None,
         is_hit: ArrayLike | None = None,
-        chunk_visits: int = CHUNK_VISITS,
     ) -> None:
         """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
 
@@ -165,7 +160,6 @@ class Evidence:
             ends: (R, D) ends of the rays, world metres.
             weights: (R,) number of rays that each row counts for; 1 if not given.
             is_hit: (R,) bool, False for no-return beams, which add only misses. All True if not given.
-            chunk_visits: voxel visits in one pass. It bounds the memory and does not change the result.
 
         Raises `InvalidArgumentError` for shapes that do not match.
         """
@@ -177,9 +171,8 @@ class Evidence:
             part = slice(begin, begin + size)
             starts, stops = self.grid.to_units(origins[part]), self.grid.to_units(ends[part])
             counts = None if weights is None else weights[part]
-            misses, shape = self.misses.view(-1), self.grid.shape
-            count_in_grid(misses, starts, stops, shape, counts, chunk_visits=chunk_visits)
-            cell, counted = flat_index(stops.floor(), shape)
+            count_in_grid(self.misses.view(-1), starts, stops, self.grid.shape, counts)
+            cell, counted = flat_index(stops.floor(), self.grid.shape)
             if is_hit is not None:
                 counted = counted & is_hit[part]
             added = counted.double() if counts is None else counts * counted

@@ -228,7 +228,6 @@ def test_calibration_errors_match_a_loop_over_bins():
             sizes.append(len(inside))
     curve = reliability(theta, labels)
     assert curve.expected_error == pytest.approx(np.average(gaps, weights=sizes), abs=1e-12)
-    assert curve.maximum_error == pytest.approx(max(gaps), abs=1e-12)
     assert curve.n_points.tolist() == sizes
 
 

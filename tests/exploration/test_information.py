@@ -38,7 +38,7 @@ def test_template_cells_equal_ray_traversal_in_order(seed, reach):
     shape = (2 * half + 1,) * 3
     found = [set() for _ in range(20)]
     for visits in traverse(starts, ends, shape):
-        for voxel, ray in zip(visits.voxel.tolist(), visits.ray.tolist(), strict=True):
+        for voxel, ray in zip(*(part.tolist() for part in visits), strict=True):
             found[ray].add(voxel)
     strides = torch.tensor([shape[1] * shape[2], shape[2], 1])
     for ray, length in enumerate(lengths.tolist()):

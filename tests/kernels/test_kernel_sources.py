@@ -88,7 +88,7 @@ def test_constants_of_the_sources_are_those_of_the_modules(tmp_path):
     found = torch.zeros(len(names)).double()
     sources = FOLDER / "mixtures/depth_cells.h", FOLDER / "rays/beam_information.h"
     sources += FOLDER / "mixtures/em_loops.h", FOLDER / "selection.h"
-    kernel_of(tmp_path, body, *sources)(1, found, device=found.device)
+    kernel_of(tmp_path, body, *sources)(1, found)
     modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops, pair_merges]
     values = [
         getattr(module, {"LANES": "CPU_LANES", "BLOCK": "_BLOCK"}.get(name, name))
@@ -108,7 +108,7 @@ def test_axes_of_a_matrix_are_those_of_the_library(dim, kind, tmp_path):
     found = torch.cat([given, torch.zeros_like(given)], 1).contiguous()
     body = f"diagonalize<{dim}>(*(double (*)[{dim}][{dim}])(x + {2 * dim * dim} * item), "
     body += f"*(double (*)[{dim}][{dim}])(x + {2 * dim * dim} * item + {dim * dim}));"
-    kernel_of(tmp_path, body, FOLDER / "jacobi.h")(200, found, device=found.device)
+    kernel_of(tmp_path, body, FOLDER / "jacobi.h")(200, found)
     values, axes = found[:, :dim].diagonal(dim1=1, dim2=2), found[:, dim:]
     size = float(given.abs().max()) or 1.0
     torch.testing.assert_close(
@@ -124,7 +124,7 @@ def test_the_mills_ratio_equals_the_error_function(tmp_path):
     x = torch.cat([torch.linspace(0, 12, 2001), torch.logspace(1, 5, 199)]).double()
     found = x.clone()
     body = "vec& v = ((vec*)x)[item]; v = mills(v);"
-    kernel_of(tmp_path, body, FOLDER / "lanes.h")(len(x) // CPU_LANES, found, device=x.device)
+    kernel_of(tmp_path, body, FOLDER / "lanes.h")(len(x) // CPU_LANES, found)
     exact = torch.from_numpy((torch.pi / 2) ** 0.5 * erfcx((x / 2**0.5).numpy()))
     assert float((found / exact - 1).abs().max()) < 2e-14
 
@@ -135,7 +135,7 @@ def test_the_angle_of_a_place_equals_the_library_function(tmp_path):
     places[:8] = torch.tensor([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [-2, 2], [-3, -3]]).double()
     found = places.clone().T.contiguous()
     body = f"vec& y = ((vec*)x)[item]; y = arctangent(y, ((vec*)x)[item + {4000 // CPU_LANES}]);"
-    kernel_of(tmp_path, body, FOLDER / "lanes.h")(4000 // CPU_LANES, found, device=found.device)
+    kernel_of(tmp_path, body, FOLDER / "lanes.h")(4000 // CPU_LANES, found)
     torch.testing.assert_close(found[0], torch.atan2(places[:, 0], places[:, 1]), rtol=4e-16, atol=1e-300)
 
 
@@ -144,7 +144,7 @@ def test_a_kernel_is_compiled_again_when_a_file_that_it_includes_changes(tmp_pat
     for number in (1.0, 2.0):
         (tmp_path / "one.h").write_text((tmp_path / "one.h").read_text().replace("1.0", str(number)))
         found = torch.zeros(1).double()
-        kernel_of(tmp_path, "x[item] = NUMBER;", tmp_path / "one.h")(1, found, device=found.device)
+        kernel_of(tmp_path, "x[item] = NUMBER;", tmp_path / "one.h")(1, found)
         assert float(found) == number
 
 

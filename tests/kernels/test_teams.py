@@ -29,6 +29,6 @@ def test_no_worker_of_a_team_reads_before_the_others_have_written(tmp_path, devi
     where = torch.device(device)
     team = Team.of(where)
     values, faults = torch.zeros(2, team.n, dtype=torch.int64, device=where)
-    FusedKernel(str(source), "passed_on")(team.n, *team, 50, values, faults, device=where)
+    FusedKernel(str(source), "passed_on")(team.n, *team, 50, values, faults)
     assert values.eq(50).all()
     assert not faults.any()

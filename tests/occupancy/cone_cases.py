@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels import pair_evidence
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
 
 
 def uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
@@ -34,6 +36,23 @@ def one_each(means: Tensor, covariances: Tensor, origins: Tensor) -> Cones:
 
 def only(cones: Cones, index: int) -> Cones:
     return Cones(*(part[index : index + 1] for part in cones))
+
+
+def joined(*parts: Cones) -> Cones:
+    return Cones(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+
+
+def moved(cones: Cones, *shift: float) -> Cones:
+    """The cones elsewhere; the shift is zero along axes that it does not state."""
+    step = torch.tensor([*shift, 0.0, 0.0][: cones.dim], dtype=torch.float64)
+    return cones._replace(means=cones.means + step, origins=cones.origins + step)
+
+
+def every_pair(form: PointForm, points: Tensor) -> PointEvidence:
+    """Every cone at every point, without any list or test of nearness."""
+    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(len(form.rows))).unbind(1)
+    shares = pair_evidence(points.T[:, None], point, *form._table, cone, form.resolution, form.cutoff)
+    return PointEvidence(*(share.view(len(points), -1).sum(1) for share in shares))
 
 
 def draw_ends(cones: Cones, n: int) -> Tensor:

@@ -15,7 +15,6 @@ from scipy import integrate, special
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.forms.cone import (
@@ -139,29 +138,6 @@ def test_evidence_is_exactly_zero_outside_the_cone():
     assert hits[[0, 2, 3]].abs().max() == 0
 
 
-@given(
-    p=st.sampled_from([0.0, 1e-9, 0.1, 3.0, 500.0]),
-    deviations=st.sampled_from([(1e-4, 1e-4), (1e-3, 1.0), (1000.0, 2000.0), (0.3, 0.1)]),
-    size=st.sampled_from([1e-3, 0.1, 10.0, 1000.0]),
-    place=st.sampled_from([0.0, 0.3, 1.0, 1.2, -1.0]),
-    origin=st.sampled_from([0.0, 5e5]),
-    corner=st.sampled_from([0.0, 0.5, 1.0, -7.0]),
-)
-def test_shares_are_finite_and_in_0_1(p, deviations, size, place, origin, corner):
-    covariance = [[deviations[0] ** 2, 0.0], [0.0, deviations[1] ** 2]]
-    cones = one_cone((origin + p, -origin), covariance, (origin, -origin))
-    low = torch.tensor([[origin + place * p, -origin]], dtype=torch.float64) - corner * size
-    hits, misses = cone_evidence(cones, low, low + size)
-    for part in (hits, misses):
-        assert 0 <= float(part) <= 1 + 1e-9
-
-
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -5.0])
-def test_invalid_boxes_are_refused(bad):
-    with pytest.raises(InvalidArgumentError, match="is no box"):
-        cone_evidence(one_cone((5.0, 0.0), ROUND), *boxes((1.0, 0.0, bad, 1.0)))
-
-
 # -- 3D ------------------------------------------------------------------------------------------------
 
 
@@ -245,19 +221,6 @@ def test_a_thin_wall_far_away_has_the_exact_evidence(generator):
     assert errors[True] < 1e-3 < errors[False] < 0.01
 
 
-def test_a_small_far_perpendicular_wall_equals_samples(generator):
-    cones = turned_cone((0.0, 0.0, 100.0), (0.5, 0.4, 0.001))
-    low = torch.tensor([[-0.3, -0.2, 90.0], [0.1, 0.1, 50.0]], dtype=torch.float64)
-    _, misses = cone_evidence(cones, low, low + 0.4, exact=True)
-    ends = cones.means + torch.randn(1_000_000, 3, generator=generator).double() * torch.tensor(
-        [0.5, 0.4, 0.001]
-    )
-    for found, corner in zip(misses, low, strict=True):
-        first, second = corner / ends, (corner + 0.4) / ends
-        enter, leave = torch.minimum(first, second).amax(1), torch.maximum(first, second).amin(1)
-        assert float(found) == pytest.approx(float((enter < leave).double().mean()), abs=2e-3)
-
-
 def test_evidence_is_zero_behind_the_sensor_beyond_the_wall_and_beside_the_cone():
     cones = turned_cone((5.0, 0.0, 0.0), (0.05, 0.5, 0.5))
     tangent = 5 * 0.5 / 5.0
@@ -300,17 +263,20 @@ def test_a_plane_through_the_sensor_origin_gives_valid_shares():
 
 
 @given(
+    dim=st.sampled_from([2, 3]),
     distance=st.sampled_from([0.0, 1e-9, 0.1, 3.0, 500.0]),
-    deviations=st.sampled_from([(1e-4,) * 3, (1e-3, 1.0, 0.5), (1000.0, 2000.0, 3000.0), (0.01, 0.01, 2.0)]),
+    deviations=st.sampled_from([(1e-4,) * 3, (1e-3, 1.0, 0.5), (1000.0, 2000.0, 3000.0), (0.3, 0.1, 2.0)]),
     size=st.sampled_from([1e-3, 0.1, 10.0, 1000.0]),
     place=st.sampled_from([0.0, 0.3, 1.0, 1.2, -1.0]),
     origin=st.sampled_from([0.0, 5e5]),
     corner=st.sampled_from([0.0, 0.5, 1.0, -7.0]),
     exact=st.booleans(),
 )
-def test_shares_of_voxels_are_finite_and_in_0_1(distance, deviations, size, place, origin, corner, exact):
+def test_shares_are_finite_and_in_0_1(dim, distance, deviations, size, place, origin, corner, exact):
     where = (origin + distance, -origin + 0.3 * distance, origin)
     cones = turned_cone(where, deviations, (0.4, 0.7), origin=(origin, -origin, origin))
+    if dim == 2:
+        cones = one_cone(where[:2], [d * d for d in deviations[:2]], (origin, -origin))
     low = cones.origins + place * (cones.means - cones.origins) - corner * size
     for part in cone_evidence(cones, low, low + size, exact=exact):
         assert 0 <= float(part) <= 1 + 1e-9
@@ -367,14 +333,6 @@ def test_polygon_probability_is_invariant_under_rotation_and_division(seed, angl
     first = polygon_probability(torch.cat([starts[:3], starts[3:4]]), torch.cat([ends[:3], corner]))
     second = polygon_probability(torch.cat([corner, starts[3:]]), torch.cat([starts[3:4], ends[3:]]))
     assert (first + second - whole).abs().max() < 1e-13
-
-
-def test_edges_of_zero_length_or_through_the_mean_add_zero():
-    starts, ends = square(0.0, 2.0)
-    whole = polygon_probability(starts, ends)
-    nothing = starts[:2]
-    padded = polygon_probability(torch.cat([starts, nothing]), torch.cat([ends, nothing]))
-    assert torch.equal(padded, whole)
 
 
 # -- the approximation of the thesis ------------------------------------------------------------------

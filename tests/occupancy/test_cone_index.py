@@ -10,6 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from occupancy.cone_cases import (
     draw_ends,
+    every_pair,
+    joined,
+    moved,
     normal,
     one_each,
     only,
@@ -20,7 +23,6 @@ from occupancy.cone_cases import (
 )
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels.evidence.point_evidence import pair_evidence
 from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy import cones as culling
 from gmmtorch.occupancy.cone_index import ConeIndex
@@ -37,7 +39,7 @@ from gmmtorch.occupancy.cones import (
     outside_cone,
 )
 from gmmtorch.occupancy.forms import point as point_form
-from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
+from gmmtorch.occupancy.forms.point import PointForm
 from gmmtorch.occupancy.grid import VoxelGrid
 from gmmtorch.occupancy.voxels.cells import cells_in_chunks
 
@@ -134,9 +136,7 @@ def test_cost_and_memory_do_not_depend_on_the_size_of_the_world(smallest):
 
 def test_two_distant_maps_share_an_index():
     small = random_cones(3, 10, 5)
-    shift = torch.tensor([1.2e7, 0, 0], dtype=torch.float64)
-    far = small._replace(means=small.means + shift, origins=small.origins + shift)
-    both = Cones(*(torch.cat(pair) for pair in zip(small, far, strict=True)))
+    both = joined(small, moved(small, 1.2e7))
     index = ConeIndex(both, 0.1)
     places, which = places_on_rays(both, 200, CUTOFF - 0.01, 0)
     pairs = set(pairs_of(index, places, places))
@@ -169,16 +169,9 @@ def test_an_invalid_extent_is_refused(extent):
 # -- cones that change, and what is kept -------------------------------------------------------------------
 
 
-def brute(cones: Cones, points: torch.Tensor, resolution: float, cutoff: float = CUTOFF) -> torch.Tensor:
-    """Hits and misses (2, M) of every cone at every point, without lists."""
-    form = PointForm(cones, resolution, cutoff)
-    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(len(form.rows))).unbind(1)
-    shares = pair_evidence(points.T[:, None], point, *form._table, cone, resolution, cutoff)
-    return torch.stack([share.view(len(points), -1).sum(1) for share in shares])
-
-
-def same_evidence(found: PointEvidence, expected: torch.Tensor) -> None:
-    torch.testing.assert_close(torch.stack(list(found)), expected, rtol=1e-10, atol=1e-12)
+def assert_is_of_all(form: PointForm, places: torch.Tensor) -> None:
+    for found, expected in zip(form(places), every_pair(form, places), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -199,22 +192,20 @@ def test_evidence_of_cones_that_come_and_go_is_that_of_all(dim, seed, n_points, 
         form = PointForm(cones, 0.1)
         for step in range(4):
             places, _ = places_on_rays(cones, n_points, CUTOFF, seed + step)
-            expected = brute(cones, places, 0.1)
-            same_evidence(form(places), expected)
-            same_evidence(form(places), expected)  # from lists that are all there
+            for _ in range(2):  # the second time from lists that are all there
+                assert_is_of_all(form, places)
             kept = (torch.rand(len(cones.counts), generator=generator) < 0.9).nonzero().squeeze(1)
             new = random_cones(dim, 4, seed + 100 + step, room=True)
             new = new._replace(means=new.means - 3.0 * step)  # also beyond the box of the first ones
             former = torch.cat([kept, torch.full((4,), -1)])
-            cones = Cones(*(torch.cat(pair) for pair in zip(cones.taken(kept), new, strict=True)))
+            cones = joined(cones.taken(kept), new)
             form = form.replaced(cones, former)
 
 
 def test_only_lists_near_changed_cones_are_made_again(smallest):
     near = random_cones(3, 60, 0, room=True)
     shift = torch.tensor([40.0, 0, 0], dtype=torch.float64)
-    far = near._replace(means=near.means + shift, origins=near.origins + shift)
-    both = Cones(*(torch.cat(pair) for pair in zip(near, far, strict=True)))
+    both = joined(near, moved(near, 40.0))
     index = ConeIndex(both, 0.1)
     here, _ = places_on_rays(near, 300, CUTOFF, 0)
     index.buckets(torch.cat([here, here + shift]))
@@ -238,7 +229,7 @@ def test_lists_that_are_kept_are_bounded(monkeypatch, smallest):
     form, most = PointForm(cones, 0.1), 0
     for step in range(6):
         places, _ = places_on_rays(cones, 300, CUTOFF, step)
-        same_evidence(form(places), brute(cones, places, 0.1))
+        assert_is_of_all(form, places)
         index = form.index
         one_part = 16 * index._n_levels * (len(cones.counts) + cone_index._PER_LIST)
         assert len(index.lists.entries) <= max(1 << 12, cone_index._KEPT_PER_CONE * 50) + one_part
@@ -253,7 +244,7 @@ def test_places_that_are_asked_again_get_shorter_lists_and_the_same_answers(monk
     places, _ = places_on_rays(cones, 40, CUTOFF, 0)
     form, n_listed = PointForm(cones, 0.1), []
     for _ in range(8):
-        same_evidence(form(places), brute(cones, places, 0.1))
+        assert_is_of_all(form, places)
         number = form.index.buckets(places).clamp_min(0)
         n_listed.append(int(form.index.lists.lengths()[number].sum()))
     assert n_listed[-1] < 0.7 * n_listed[0]
@@ -281,10 +272,11 @@ def test_strange_cones_give_the_evidence_of_all(case, monkeypatch):
         cones = cones.taken(first)._replace(origins=origins)
     places, _ = places_on_rays(cones, 60, CUTOFF, 0)
     outside = torch.tensor([[torch.inf, 0, 0], [0, -torch.inf, 1], [1e300, 0, 0], [-1e9, 5, 5]]).double()
-    found = PointForm(cones, 0.1)(torch.cat([places, outside]))
+    form = PointForm(cones, 0.1)
+    found = form(torch.cat([places, outside]))
     assert float(found.hits[-4:].abs().max() + found.misses[-4:].abs().max()) == 0
-    expected = brute(cones, places, 0.1)
-    torch.testing.assert_close(torch.stack(list(found))[:, :60], expected, rtol=1e-6, atol=1e-9)
+    for values, expected in zip(found, every_pair(form, places), strict=True):
+        torch.testing.assert_close(values[:60], expected, rtol=1e-6, atol=1e-9)
 
 
 # -- culling: all cells and boxes that a cone meets are kept, and few others ---------------------------
@@ -363,11 +355,11 @@ def test_a_face_that_a_ray_crosses_is_visited(dim, seed):
 def test_ball_rows_contain_all_ends():
     grid, cones = GRIDS[3], some_cones(3, 4, 2)
     cones = cones._replace(max_range=torch.tensor([False, True, False, False]))
-    rows = ball_rows(cones, grid)
-    assert rows.cone.tolist() == [0, 2, 3]
-    held = {index: set() for index in rows.cone.tolist()}
-    for row, cells in cells_in_chunks(rows.first, rows.number, 77):
-        for index, *cell in zip(rows.cone[row].tolist(), *(c.tolist() for c in cells), strict=True):
+    cone, first, number = ball_rows(cones, grid)
+    assert cone.tolist() == [0, 2, 3]
+    held = {index: set() for index in cone.tolist()}
+    for row, cells in cells_in_chunks(first, number, 77):
+        for index, *cell in zip(cone[row].tolist(), *(c.tolist() for c in cells), strict=True):
             held[index].add(tuple(cell))
     for index, cells in held.items():
         place = grid.to_units(ends_within(only(cones, index), 300)).floor().long()

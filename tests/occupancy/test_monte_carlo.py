@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from occupancy.cone_cases import one_cone
+from occupancy.cone_cases import joined, one_cone
 from scipy.stats import chi2, multivariate_normal
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
@@ -28,7 +28,7 @@ def three_cones() -> Cones:
     shapes = [(0.2, 0.01, 0.1), (0.05, 0.05, 0.05), (0.01, 0.3, 0.2)]
     parts = zip([(3.0, 0, 1), (0, 4.0, 1), (-3.0, -1, 0)], shapes, (70.0, 20.0, 10.0), strict=True)
     each = [one_cone(mean, shape, (0, 0, 0.5), count) for mean, shape, count in parts]
-    return Cones(*(torch.cat(fields) for fields in zip(*each, strict=True)))
+    return joined(*each)
 
 
 def seeded(seed: int = 0) -> torch.Generator:
@@ -96,8 +96,7 @@ def test_misses_equal_the_share_of_rays_that_leave_a_cell():
     assert found[0, 0] == pytest.approx(50, abs=1e-9)  # every ray leaves the cell of the sensor
     np.testing.assert_allclose(found, 50 * one, atol=50 * 2e-3)
     second = np.array([1.1, 2.3])
-    views = component(30.0), one_cone(MEAN_2D, COVARIANCE_2D, second, 20.0)
-    both = Cones(*(torch.cat(fields) for fields in zip(*views, strict=True)))
+    both = joined(component(30.0), one_cone(MEAN_2D, COVARIANCE_2D, second, 20.0))
     expected = 30 * one + 20 * missed_share(grid, MEAN_2D, COVARIANCE_2D, second)
     np.testing.assert_allclose(evidence_of(grid, both, 1 << 17).misses.numpy(), expected, atol=50 * 3e-3)
 
@@ -178,12 +177,6 @@ def test_rays_start_at_the_sensor_origin_and_depend_on_the_seed(sampling):
     assert torch.equal(first.ends, again.ends)
     assert not torch.equal(first.ends, other.ends)
     assert first.origins.unique(dim=0).tolist() == [[0.0, 0.0, 0.5]]
-
-
-def test_only_no_return_components_add_no_hits():
-    what = three_cones()._replace(max_range=torch.tensor([False, True, False]))
-    rays = sample_rays(what, 300, seeded())
-    assert float(rays.weights[rays.is_hit].sum()) == pytest.approx(80)
 
 
 @pytest.mark.parametrize("covariance", [[[1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0], [0.0, 0.0]]])

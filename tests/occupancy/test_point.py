@@ -12,14 +12,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from occupancy.cone_cases import one_cone, random_cones
+from occupancy.cone_cases import every_pair, joined, moved, one_cone, random_cones
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, NumericalError
 from gmmtorch.kernels.choice import kernels
-from gmmtorch.kernels.evidence.point_evidence import pair_evidence
 from gmmtorch.occupancy import cone_index
 from gmmtorch.occupancy.cones import Cones
 from gmmtorch.occupancy.evidence import occupancy_probability
@@ -151,13 +150,6 @@ def indexed_from(n_pairs: int) -> Iterator[None]:
         patch.setattr(cone_index, "_FEW_PAIRS", n_pairs)
         patch.setattr(cone_index, "_POINTS_PER_LIST", 1)
         yield
-
-
-def every_pair(form: PointForm, points: Tensor) -> PointEvidence:
-    """Every cone at every point, without any list or test of nearness."""
-    point, cone = torch.cartesian_prod(torch.arange(len(points)), torch.arange(len(form.rows))).unbind(1)
-    shares = pair_evidence(points.T[:, None], point, *form._table, cone, form.resolution, form.cutoff)
-    return PointEvidence(*(share.view(len(points), -1).sum(1) for share in shares))
 
 
 @settings(max_examples=20)
@@ -337,30 +329,16 @@ def test_gradients_are_finite(dim, resolution):
 H = 0.3
 
 
-def taken(cones: Cones, rows: torch.Tensor) -> Cones:
-    return Cones(*(part[rows] for part in cones))
-
-
-def joined(*parts: Cones) -> Cones:
-    return Cones(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
-
-
-def moved(cones: Cones, x: float) -> Cones:
-    shift = torch.zeros(cones.dim, dtype=torch.float64)
-    shift[0] = x
-    return cones._replace(means=cones.means + shift, origins=cones.origins + shift)
-
-
 def states(dim: int) -> list[Cones]:
     """A map that grows, also below its lowest corner, loses and changes cones, and is emptied."""
     base, far = random_cones(dim, 40, 0, room=True), moved(random_cones(dim, 10, 1, room=True), -9.0)
     grown = joined(base, far)
-    without = taken(grown, torch.arange(5, 50))
+    without = grown.taken(torch.arange(5, 50))
     counted = without._replace(counts=without.counts * (1 + (torch.arange(45) == 7)))
-    swapped = taken(counted, torch.cat([torch.tensor([9]), torch.arange(9), torch.arange(10, 45)]))
-    doubled = joined(swapped, taken(swapped, torch.arange(3)))
-    none = taken(base, torch.arange(0))
-    remote = moved(taken(base, torch.arange(4)), 1e8)
+    swapped = counted.taken(torch.cat([torch.tensor([9]), torch.arange(9), torch.arange(10, 45)]))
+    doubled = joined(swapped, swapped.taken(torch.arange(3)))
+    none = base.taken(torch.arange(0))
+    remote = moved(base.taken(torch.arange(4)), 1e8)
     return [base, grown, without, counted, counted, swapped, doubled, none, joined(base, remote), base]
 
 
@@ -391,7 +369,7 @@ def test_only_cells_near_changed_cones_are_evaluated():
     everything = kept.n_evaluated
     kept.update(joined(near, far), grid)
     assert kept.n_evaluated == 0
-    kept.update(joined(near, taken(far, torch.arange(39))), grid)
+    kept.update(joined(near, far.taken(torch.arange(39))), grid)
     assert 0 < kept.n_evaluated < everything / 2
 
 

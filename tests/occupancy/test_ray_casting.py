@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from hypothesis import strategies as st
 from occupancy.exact_dda import voxels_left
 from torch import Tensor
 
-import gmmtorch.occupancy.voxels.ray_casting as module
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, occupied_cells, sum_evidence, to_lattice
 from gmmtorch.occupancy.voxels.ray_casting import cast_evidence, near_interval
@@ -23,7 +23,7 @@ from gmmtorch.simulation.mesh_world import MeshWorld
 Counts = dict[tuple[int, ...], tuple[float, float]]
 
 
-def box(low: list[int], high: list[int]) -> Box:
+def box(low: Sequence[int], high: Sequence[int]) -> Box:
     return Box(torch.tensor(low), torch.tensor(high))
 
 
@@ -111,11 +111,10 @@ def test_evidence_of_disjoint_boxes_sums_to_the_whole(seed, axis):
         assert found[cell] == pytest.approx(both, rel=1e-6)
 
 
-def test_counts_do_not_depend_on_order_and_chunks(monkeypatch):
+def test_counts_do_not_depend_on_order():
     starts, stops, is_hit = random_rays(300, 1)
     expected = {b: counts(cast_evidence(starts, stops, is_hit, 1.0, w)) for b, w in enumerate((SMALL, LARGE))}
     order = torch.randperm(300, generator=torch.Generator().manual_seed(0))
-    monkeypatch.setattr(module, "_CHUNK_VISITS", 7)
     for b, within in enumerate((SMALL, LARGE)):
         shuffled = cast_evidence(starts[order], stops[order], is_hit[order], 1.0, within)
         assert counts(shuffled) == expected[b]
@@ -267,10 +266,6 @@ def test_hit_places_replace_the_ends_and_must_be_finite():
 # -- cells that a mesh meets ---------------------------------------------------------------------------
 
 
-def lattice(low: tuple[int, ...], high: tuple[int, ...]) -> Box:
-    return Box(torch.tensor(low), torch.tensor(high))
-
-
 def clipped(triangle: np.ndarray, low: np.ndarray) -> float:
     """Area of a triangle (3, 3) within the unit cube at `low`, by clipping it at six planes."""
     polygon = list(triangle)
@@ -292,7 +287,7 @@ def clipped(triangle: np.ndarray, low: np.ndarray) -> float:
 
 
 def test_a_cell_is_occupied_if_and_only_if_a_triangle_meets_it(generator):
-    window = lattice((-2, -1, 0), (4, 5, 5))
+    window = box((-2, -1, 0), (4, 5, 5))
     for size in (0.4, 1.5, 6.0):
         triangles = 4 * torch.rand(12, 1, 3, generator=generator, dtype=torch.float64)
         triangles = triangles + size * torch.randn(12, 3, 3, generator=generator, dtype=torch.float64)
@@ -305,7 +300,7 @@ def test_a_cell_is_occupied_if_and_only_if_a_triangle_meets_it(generator):
 
 def test_points_on_a_mesh_lie_in_its_cells_and_its_cells_are_near_it(generator):
     mesh = torch.cat([ball((1.03, 0.95, 1.2), 0.87), box_mesh((0.31, 0.22, 0.13), (2.24, 1.93, 0.37))])
-    window = lattice((0, 0, 0), (24, 24, 24))
+    window = box((0, 0, 0), (24, 24, 24))
     found = occupied_cells(mesh, 0.1, window)
     share = torch.rand(400, len(mesh), 3, generator=generator, dtype=torch.float64) + 1e-9
     points = torch.einsum("ntc,tcd->ntd", share / share.sum(2, keepdim=True), mesh).flatten(0, 1)
@@ -321,7 +316,7 @@ def test_points_on_a_mesh_lie_in_its_cells_and_its_cells_are_near_it(generator):
 def test_a_floor_in_a_lattice_plane_counts_only_for_the_cells_above():
     floor = box_mesh((0, 0, -5.0), (2.0, 1.0, 0.6))[-4:-2]  # its top, as two triangles at z = 3 · 0.2
     assert bool((floor[..., 2] == 0.6).all())
-    found = occupied_cells(floor, 0.2, lattice((-3, -3, -3), (15, 9, 9)))
+    found = occupied_cells(floor, 0.2, box((-3, -3, -3), (15, 9, 9)))
     cells = found.nonzero() - 3
     assert cells[:, 2].unique().tolist() == [3]
     # Its edges at 2 m and 1 m lie in planes too.
@@ -332,9 +327,7 @@ def test_a_floor_in_a_lattice_plane_counts_only_for_the_cells_above():
 
 def test_a_hall_of_50_m_marks_one_layer_for_each_surface():
     nx, ny, nz = 250, 200, 40
-    found = occupied_cells(
-        box_mesh((0.1, 0.1, 0.1), (49.9, 39.9, 7.9)), 0.2, lattice((0, 0, 0), (nx, ny, nz))
-    )
+    found = occupied_cells(box_mesh((0.1, 0.1, 0.1), (49.9, 39.9, 7.9)), 0.2, box((0, 0, 0), (nx, ny, nz)))
     shell = torch.ones(nx, ny, nz, dtype=torch.bool)
     shell[1:-1, 1:-1, 1:-1] = False
     assert torch.equal(found, shell)
@@ -342,22 +335,22 @@ def test_a_hall_of_50_m_marks_one_layer_for_each_surface():
 
 def test_a_diagonal_plane_marks_only_the_cells_that_it_divides():
     corners = torch.tensor([[0.0, 0, 0.5], [4, 4, 0.5], [4, 4, 0.9]], dtype=torch.float64)
-    found = occupied_cells(corners[None], 1.0, lattice((0, 0, 0), (4, 4, 1)))
+    found = occupied_cells(corners[None], 1.0, box((0, 0, 0), (4, 4, 1)))
     assert torch.equal(found[:, :, 0], torch.eye(4, dtype=torch.bool))
 
 
 def test_the_box_does_not_change_the_cells(generator):
     mesh = 5 * torch.rand(30, 3, 3, generator=generator, dtype=torch.float64)
-    whole = occupied_cells(mesh, 0.3, lattice((-1, -1, -1), (20, 20, 20)))
-    part = occupied_cells(mesh, 0.3, lattice((4, 2, 7), (9, 13, 12)))
+    whole = occupied_cells(mesh, 0.3, box((-1, -1, -1), (20, 20, 20)))
+    part = occupied_cells(mesh, 0.3, box((4, 2, 7), (9, 13, 12)))
     assert torch.equal(part, whole[5:10, 3:14, 8:13])
-    assert not bool(occupied_cells(mesh, 0.3, lattice((50, 0, 0), (55, 5, 5))).any())
+    assert not bool(occupied_cells(mesh, 0.3, box((50, 0, 0), (55, 5, 5))).any())
 
 
 def test_cells_are_the_same_500_km_away(generator):
     mesh = 3 * torch.rand(20, 3, 3, generator=generator, dtype=torch.float64)
     shift = torch.tensor([2_500_000, -1_000_000, 5])
-    here = occupied_cells(mesh, 0.2, lattice((0, 0, 0), (16, 16, 16)))
+    here = occupied_cells(mesh, 0.2, box((0, 0, 0), (16, 16, 16)))
     there = occupied_cells(mesh + 0.2 * shift, 0.2, Box(shift, shift + 16))
     assert torch.equal(here, there)
 
@@ -366,7 +359,7 @@ def test_cells_are_the_same_500_km_away(generator):
 def test_a_triangle_without_area_counts_as_its_line(end):
     start, end = torch.tensor([0.4, 0.4, 0.4]).double(), torch.tensor(end).double()
     line = torch.stack([start, end, (start + end) / 2])[None]
-    found = occupied_cells(line, 1.0, lattice((0, 0, 0), (4, 4, 4)))
+    found = occupied_cells(line, 1.0, box((0, 0, 0), (4, 4, 4)))
     along = start + torch.linspace(0, 1, 5000, dtype=torch.float64)[:, None] * (end - start)
     expected = torch.zeros(4, 4, 4, dtype=torch.bool)
     expected[along.floor().long().unbind(1)] = True
@@ -374,7 +367,7 @@ def test_a_triangle_without_area_counts_as_its_line(end):
 
 
 def test_no_triangles_mark_nothing_and_invalid_ones_are_refused():
-    window = lattice((0, 0, 0), (3, 3, 3))
+    window = box((0, 0, 0), (3, 3, 3))
     nothing: Tensor = torch.zeros(0, 3, 3)
     assert not bool(occupied_cells(nothing, 0.2, window).any())
     with pytest.raises(InvalidArgumentError, match=r"shape \(3, 3\)"):

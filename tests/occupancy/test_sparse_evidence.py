@@ -84,7 +84,7 @@ def test_portions_and_chunks_of_rays_do_not_change_the_counts(dim):
     origins, ends = random_rays(60, dim)
     whole, parts = counted(origins, ends), SparseEvidence(RESOLUTION, dim)
     for i in range(60):
-        parts.add_rays(origins[i : i + 1], ends[i : i + 1], chunk_visits=3)
+        parts.add_rays(origins[i : i + 1], ends[i : i + 1])
     assert counts_of(parts) == counts_of(whole)
     assert parts.keys.tolist() == sorted(set(parts.keys.tolist()))
     assert parts.n_blocks == whole.n_blocks

@@ -241,7 +241,7 @@ class OctoMapMap(BaselineMap):
         """Flat index of every cell that a beam to each end (B, 3) enters and leaves."""
         starts = (origin / self.resolution).expand_as(ends)
         visits = traverse(starts, ends / self.resolution, shape, low=low)
-        return torch.cat([torch.empty(0, dtype=torch.int64), *(visit.voxel for visit in visits)])
+        return torch.cat([torch.empty(0, dtype=torch.int64), *(voxel for voxel, _ in visits)])
 
     def _local(self, points: Tensor) -> Tensor:
         """Points (M, 3) in the octree's frame; 2D points are in the middle of the layer above zero."""

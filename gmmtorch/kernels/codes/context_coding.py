@@ -1,25 +1,21 @@
-"""Components as an adaptive binary code, written and read; the twin is `mapping.codec.context_model`."""
+"""Components and attributes as adaptive binary codes, written and read; the twins are in `mapping.codec`."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
 MOST_STEPS = 2048
 """For each byte of a batch, to find the ranks of its origins; about 0.1 ms."""
 
-_CODINGS = {
-    (dim, writes): FusedKernel(
-        "codes/context_coding.h", f"context_coding<{dim}, {str(writes).lower()}>", rounds_each=True
-    )
-    for dim in (2, 3)
-    for writes in (True, False)
-}
+_KINDS = itertools.product((2, 3), (True, False))  # dimension, and whether the code is written
+_CODINGS = templated("codes/context_coding.h", "context_coding", _KINDS, rounds_each=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,5 +71,25 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writ
     scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)
     values = list(vars(batch).values())[1:-1]  # without side and cells
     kernel = _CODINGS[batch.dim, writes]
-    kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result, device=result.device)
+    kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result)
+    return int(result)
+
+
+_NUMBERS = templated("codes/number_coding.h", "number_coding", (True, False), rounds_each=True)
+
+
+def number_coding(
+    rows: Tensor, width: int, power: Tensor, tables: ChanceTables, stream: Tensor, writes: bool
+) -> int:
+    """Write rows (K, n) of whole numbers, with `width` columns of the channel, to the stream (B,), uint8, or
+    read them into zeros; returns the number of bytes used; −1 if the stream is damaged or too short.
+
+    power (2 M + 1,): √2 to the powers −M … M, of which deviations are. All tensors are on the CPU.
+    """
+    result = torch.zeros(1, dtype=torch.int64)
+    level, height = torch.zeros(width, dtype=torch.int64), torch.zeros(width, dtype=torch.float64)
+    sizes = (len(rows), rows.shape[1], width)
+    slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
+    scratch = (rows, power, len(power) // 2, level, height, *slots)
+    _NUMBERS[writes](1, *sizes, *scratch, stream, len(stream), 0, result)
     return int(result)

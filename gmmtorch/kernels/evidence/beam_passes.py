@@ -1,7 +1,6 @@
 """Beams of one sensor that pass through components, and that end on them, for forgetting.
 
-The fused kernel handles one component in one item, and keeps no list of pairs. It counts as its twin does,
-unless a beam is within rounding of a limit.
+The fused kernel handles one component in one item, and keeps no list of pairs.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
 
 class PassLimits(NamedTuple):
@@ -33,16 +32,11 @@ class PassLimits(NamedTuple):
     explained: float
 
 
-_KERNELS = {dim: FusedKernel("evidence/beam_passes.h", f"beam_passes<{dim}>") for dim in (2, 3)}
+_KERNELS = templated("evidence/beam_passes.h", "beam_passes", (2, 3))
 
 
 def beam_passes(
-    whitening: Tensor,
-    offsets: Tensor,
-    deviations: Tensor,
-    beams: Tensor,
-    is_hit: Tensor,
-    limits: PassLimits,
+    whitening: Tensor, offsets: Tensor, deviations: Tensor, beams: Tensor, is_hit: Tensor, limits: PassLimits
 ) -> tuple[Tensor, Tensor]:
     """Number of beams (K,) that pass through each component, and number of returns (K,) on it, float64.
 
@@ -59,9 +53,8 @@ def beam_passes(
         return _batched(whitening, offsets, deviations[:, 0], (directions, lengths, is_hit), limits)
     k, dim = offsets.shape
     passed, returned = (offsets.new_empty(k) for _ in range(2))
-    rows = [part.contiguous() for part in given]
     numbers = limits._replace(through=limits.through**2)
-    _KERNELS[dim](k, *rows, len(beams), *numbers, passed, returned, device=offsets.device)
+    _KERNELS[dim](k, *given, len(beams), *numbers, passed, returned)
     return passed, returned
 
 

@@ -46,37 +46,16 @@ def add_row_flux(
     """
     cone, plane, forward, first, number = rows
     origin, side, shape = grid
-    dim, device = len(shape), misses.device
+    dim = len(shape)
     if dim == 2:
         first = torch.cat([first, torch.zeros_like(first)], 1)
         number = torch.cat([number, torch.ones_like(number)], 1)
     axes = [axis, *(a for a in range(dim) if a != axis)]
     strides = [math.prod(shape[a + 1 :]) if target is None else 0 for a in axes]
-    pad = 3 - dim
-    _FLUX(
-        len(cone),
-        cones.contiguous(),
-        counts.contiguous(),
-        cone.contiguous(),
-        plane.contiguous(),
-        forward.contiguous(),
-        first.contiguous(),
-        number.contiguous(),
-        target,
-        dim,
-        *axes,
-        *[-1] * pad,
-        *(origin[a] for a in axes),
-        *[0.0] * pad,
-        side,
-        side ** (dim - 1),
-        *strides,
-        *[0] * pad,
-        cutoff,
-        *limits,
-        misses,
-        device=device,
-    )
+    pad = [0] * (3 - dim)
+    place = dim, *axes, *(-1 for _ in pad), *(origin[a] for a in axes), *pad, side, side ** (dim - 1)
+    given = cones, counts, cone, plane, forward, first, number, target
+    _FLUX(len(cone), *given, *place, *strides, *pad, cutoff, *limits, misses)
 
 
 def add_cell_mass(
@@ -94,33 +73,15 @@ def add_cell_mass(
     Args:
         hits: (cells,) float64, row-major; or (M,), of any cells, if `target` is given.
         cones, counts: as in `add_row_flux`.
-        boxes: cone (R,) and first, number (R, D) of `BallRows` (`occupancy.cones`).
+        boxes: cone (R,), lowest cell and number of cells (R, D), see `occupancy.cones.ball_rows`.
         grid, limits, target: as in `add_row_flux`.
     """
-    cone, first, number = (part.contiguous() for part in boxes)
     origin, side, shape = grid
     dim = len(shape)
-    pad = 3 - dim
+    pad = [0] * (3 - dim)
     strides = [math.prod(shape[a + 1 :]) if target is None else 0 for a in range(dim)]
-    _MASS(
-        len(cone),
-        cones.contiguous(),
-        counts.contiguous(),
-        cone,
-        first,
-        number,
-        target,
-        dim,
-        *origin,
-        *[0.0] * pad,
-        side,
-        *strides,
-        *[0] * pad,
-        cutoff,
-        *limits,
-        hits,
-        device=hits.device,
-    )
+    place = dim, *origin, *pad, side, *strides, *pad
+    _MASS(len(boxes[0]), cones, counts, *boxes, target, *place, cutoff, *limits, hits)
 
 
 def whitened_rows(matrix: Tensor, origin: Tensor, toward: Tensor, log_norm: Tensor) -> Tensor:

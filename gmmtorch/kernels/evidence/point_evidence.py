@@ -2,8 +2,7 @@
 lists of the cones whose hulls can give evidence near a place, see `occupancy.cone_index`.
 
 The fused kernel walks the list of cones of each point, tests whether the point is within the cutoff, and
-evaluates those that are. Its twin evaluates blocks of points. Their evidence differs by at most 10⁻¹² of the
-count of a cone, for each cone.
+evaluates those that are. Its twin evaluates blocks of points.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.compiler import CPU_LANES, templated
 from gmmtorch.linalg import ragged_index
 
 _SQRT_HALF_PI = math.sqrt(math.pi / 2)
@@ -36,7 +35,7 @@ class PointTable(NamedTuple):
     tilts: Tensor
 
 
-_EVIDENCE = {dim: FusedKernel("evidence/point_evidence.h", f"point_evidence<{dim}>") for dim in (2, 3)}
+_EVIDENCE = templated("evidence/point_evidence.h", "point_evidence", (2, 3))
 
 
 def listed_evidence(
@@ -61,29 +60,12 @@ def listed_evidence(
         rows: see `PointTable.rows`.
     """
     lanes = CPU_LANES if points.device.type == "cpu" else 1
-    _EVIDENCE[points.shape[1]](
-        (order.shape[0] + lanes - 1) // lanes,
-        points.contiguous(),
-        order,
-        bucket,
-        order.shape[0],
-        *lists,
-        rows,
-        resolution,
-        cutoff,
-        *found,
-        device=points.device,
-    )
+    given = points, order, bucket, len(order), *lists, rows
+    _EVIDENCE[points.shape[1]](-(-len(order) // lanes), *given, resolution, cutoff, *found)
 
 
 def pair_evidence(
-    points: Tensor,
-    block: Tensor,
-    rows: Tensor,
-    tilts: Tensor,
-    cone: Tensor,
-    resolution: float,
-    cutoff: float,
+    points: Tensor, block: Tensor, rows: Tensor, tilts: Tensor, cone: Tensor, resolution: float, cutoff: float
 ) -> tuple[Tensor, Tensor]:
     """Hits and misses (B, R) of R pairs of a block (R,) of points (D, B, b) and a cone (R,) of a table."""
     dim = points.shape[0]
@@ -155,8 +137,8 @@ def sum_of(terms: Iterable[Tensor]) -> Tensor:
 
 
 _FEW_POINTS = "evidence/few_points.h"
-_NEAR_FEW = {dim: FusedKernel(_FEW_POINTS, f"few_points_near<{dim}>") for dim in (2, 3)}
-_OF_FEW = {dim: FusedKernel(_FEW_POINTS, f"few_points_evidence<{dim}>") for dim in (2, 3)}
+_NEAR_FEW = templated(_FEW_POINTS, "few_points_near", (2, 3))
+_OF_FEW = templated(_FEW_POINTS, "few_points_evidence", (2, 3))
 _VIEWS_AT_ONCE = 4096
 
 
@@ -174,10 +156,10 @@ def few_points_evidence(
     """
     n, dim = points.shape
     device = points.device
-    means, covariances, max_range, origins, by, seen_from, count = (value.contiguous() for value in views)
-    counts, points = torch.empty_like(by), points.contiguous()
+    means, covariances, max_range, origins, by, seen_from, count = views
+    counts = torch.empty_like(by)
     tested = means, covariances, origins, by, seen_from, points, n, widest, cutoff
-    _NEAR_FEW[dim](len(by), *tested, counts, device=device)
+    _NEAR_FEW[dim](len(by), *tested, counts)
     found = points.new_zeros(len(sides), 2, n)
     lengths = torch.tensor(list(sides), dtype=torch.float64).to(device, non_blocking=True)
     parts = 1 if device.type == "cpu" else n
@@ -185,12 +167,12 @@ def few_points_evidence(
         each = points.new_empty(len(chosen), *found.shape)
         given = means, covariances, max_range, origins, by, seen_from, count, points, n
         rows = chosen, *given, lengths, len(sides), cutoff, parts, each
-        _OF_FEW[dim](len(chosen) * parts, *rows, device=device)
+        _OF_FEW[dim](len(chosen) * parts, *rows)
         found += each.sum(0)
     return found, counts.sum()
 
 
-_NEAR = {dim: FusedKernel("evidence/near_lists.h", f"near_lists<{dim}>") for dim in (2, 3)}
+_NEAR = templated("evidence/near_lists.h", "near_lists", (2, 3))
 _PARTS_OF_LISTS = 32  # of a list, on a device with many threads
 
 
@@ -241,10 +223,10 @@ def near_lists(
         firsts, counts = ends - lengths, torch.zeros_like(lengths, dtype=torch.float64)
         near = torch.empty(int(ends[-1]) if len(ends) else 0, dtype=torch.bool, device=table.device)
         lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
-        arguments = (table, *given, lists, firsts, centers.contiguous(), radii.contiguous(), len(lists))
+        arguments = (table, *given, lists, firsts, centers, radii, len(lists))
         sizes = (cube_reach, spread, table.shape[1], cutoff, parts)
         n_items = (len(lists) + lanes - 1) // lanes * parts
-        _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts, device=table.device)
+        _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts)
         counts = counts.long()
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])

@@ -2,16 +2,13 @@
 cells.
 
 The twins of `cell_moments` and `piece_cuts` are in `mixture.em.partition`, that of `distinct_keys` in
-`gmmtorch.linalg`, whose fused kernel runs on the CPU. Cells and their numbers equal the twin's; sums differ
-by rounding. Pieces are cut for all levels in one launch. They are those of the twin, except where a decision
-depends on rounding: a point within rounding of a cut, or two directions of equal extent.
+`gmmtorch.linalg`, whose fused kernel runs on the CPU. Pieces are cut for all levels in one launch.
 
 A pixel (u, v) of depth z sees the point z (a + u b + v c) + t. All moments of a patch of 4 × 4 pixels are
 therefore sums of z and z², multiplied by u, v and their products. A patch that is smaller than a cell, across
 the view and in depth, is added to the cell that contains its mean. The pixels of any other patch are added
 one by one. The points themselves are never stored. One launch passes over all images: in one item on a CPU;
-on CUDA each patch is an item. Its cells are those of the twin, except for patches and points within rounding
-of the side of a cell.
+on CUDA each patch is an item.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import FusedKernel, Team, templated
 
 KEY_BITS = 20
 """Bits of one cell coordinate in a key, as in `cells.h`."""
@@ -35,20 +32,12 @@ PATCH = 4
 
 _WIDTH = 10  # features in 3D
 _DISTINCT = FusedKernel("mixtures/cells.h", "distinct_keys", shares=True)
-_MOMENTS = {dim: FusedKernel("mixtures/cells.h", f"cell_moments<{dim}>", shares=True) for dim in (1, 2, 3)}
-_REAL = {torch.float32: "float", torch.float64: "double"}
-_DEPTHS = {
-    dtype: FusedKernel("mixtures/depth_cells.h", f"depth_cells<{real}>", shares=True)
-    for dtype, real in _REAL.items()
-}
-_RANGES = {
-    dtype: FusedKernel("mixtures/depth_cells.h", f"range_sums<{real}>") for dtype, real in _REAL.items()
-}
-_VALUES = {
-    dtype: FusedKernel("mixtures/cells.h", f"value_sums<{real}>", shares=True)
-    for dtype, real in _REAL.items()
-}
-_CURVE = {dim: FusedKernel("mixtures/cells.h", f"curve_keys<{dim}>", rounds_each=True) for dim in (1, 2, 3)}
+_MOMENTS = templated("mixtures/cells.h", "cell_moments", (1, 2, 3), shares=True)
+_REAL = torch.float32, torch.float64
+_DEPTHS = templated("mixtures/depth_cells.h", "depth_cells", _REAL, shares=True)
+_RANGES = templated("mixtures/depth_cells.h", "range_sums", _REAL)
+_VALUES = templated("mixtures/cells.h", "value_sums", _REAL, shares=True)
+_CURVE = templated("mixtures/cells.h", "curve_keys", (1, 2, 3), rounds_each=True)
 _MEANS = FusedKernel("mixtures/cells.h", "mean_features")
 _MOST_CELLS_ON_GPU = 1 << 18
 _FACTORS = np.array([2 ** (-step / 3) for step in range(3 * KEY_BITS + 7)])
@@ -66,7 +55,7 @@ def distinct_keys(keys: Tensor) -> tuple[Tensor, Tensor]:
     distinct = torch.empty_like(keys)
     number = torch.empty_like(keys)
     n_distinct = torch.zeros(1, dtype=torch.int64)
-    _DISTINCT(1, keys, n, place, n_places, distinct, number, n_distinct, device=keys.device)
+    _DISTINCT(1, keys, n, place, n_places, distinct, number, n_distinct)
     return distinct[: int(n_distinct)], number
 
 
@@ -74,7 +63,7 @@ def curve_keys(points: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """The places (N,), int16, of points (N, D), float64, D ≤ 3, on a curve through the box from `low` to
     `high` (D,). The twin is in `gmmtorch.linalg`, to the bit."""
     keys = torch.empty(len(points), dtype=torch.int16, device=points.device)
-    _CURVE[points.shape[1]](len(points), points.contiguous(), low, high, keys, device=points.device)
+    _CURVE[points.shape[1]](len(points), points, low, high, keys)
     return keys
 
 
@@ -112,14 +101,14 @@ def cell_moments(
     keys, rank, member, n_cells = whole.split((n_rows, n_rows, n, 1))
     sums, team = points.new_zeros(n_rows, width), Team.of(device)
     factors = torch.from_numpy(_FACTORS).to(device, non_blocking=True)
-    given = points.contiguous(), None if weight is None else weight.contiguous(), n, *box
+    given = points, weight, n, *box
     sizes = finest, most_along, factors, max_cells, n_places
-    _MOMENTS[dim](team.n, *team, *given, *sizes, places, keys, member, sums, n_cells, device=device)
+    _MOMENTS[dim](team.n, *team, *given, *sizes, places, keys, member, sums, n_cells)
     found = int(n_cells)
     order = keys[:found].argsort() if on_cpu else keys.argsort()[n_rows - found :]  # a free place holds -1
     made = sums.new_empty(found * (width + 1))
     features, mass = made[: found * width].view(found, width), made[found * width :]
-    _MEANS(found, order, sums, width, features, mass, rank, device=device)
+    _MEANS(found, order, sums, width, features, mass, rank)
     return features, mass, rank[member]
 
 
@@ -133,8 +122,7 @@ def value_sums(values: Tensor, member: Tensor, n_cells: int, middle: Tensor) -> 
     n, columns = values.shape
     width = 1 + columns + columns * (columns + 1) // 2
     sums = torch.zeros(n_cells, width, dtype=torch.float64, device=values.device)
-    given = values.contiguous(), columns, member.contiguous(), middle
-    _VALUES[values.dtype](n, *given, sums, device=values.device)
+    _VALUES[values.dtype](n, values, columns, member, middle, sums)
     return sums
 
 
@@ -193,13 +181,13 @@ def _fused(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     n_cells = torch.zeros(1, dtype=torch.int64, device=device)
     n_items = 1 if on_cpu else max(-(-h // PATCH) * -(-w // PATCH) for h, w in (d.shape for d in depths))
     tables = max_cells, n_places, places, keys, sums, counts, n_cells
-    _DEPTHS[depths[0].dtype](1 if on_cpu else n * n_items, rows, n, n_items, *tables, device=device)
+    _DEPTHS[depths[0].dtype](1 if on_cpu else n * n_items, rows, n, n_items, *tables)
     found = int(n_cells)
     if found > max_cells:
         return None
     order = keys[:found].argsort() if on_cpu else keys.argsort()[n_rows - found :]  # a free place holds -1
     ordered = sums.new_empty(found, 3), sums.new_empty(found, _WIDTH), counts.new_empty(found, n)
-    _ORDERED(found, order, keys, sums, counts, n, *ordered, device=device)
+    _ORDERED(found, order, keys, sums, counts, n, *ordered)
     return DepthCells(*ordered)
 
 
@@ -222,7 +210,7 @@ def range_sums(depths: Sequence[Tensor], camera: np.ndarray, max_range: np.ndarr
     depths, rows = _rows_of(depths, np.concatenate([camera, max_range[:, None]], 1))
     n_items = max(len(depth) for depth in depths)
     sums = torch.empty(len(depths) * n_items, 2, dtype=torch.float64, device=rows.device)
-    _RANGES[depths[0].dtype](len(sums), rows, n_items, sums, device=rows.device)
+    _RANGES[depths[0].dtype](len(sums), rows, n_items, sums)
     return sums.sum(0)
 
 
@@ -237,8 +225,7 @@ def cell_features(cells: DepthCells, center: Tensor, side: float) -> Tensor | No
     if not is_fused(*cells, center):
         return None
     features = torch.empty_like(cells.sums)
-    given = cells.corners, cells.sums, center, side
-    _FEATURES(len(features), *given, features, device=features.device)
+    _FEATURES(len(features), cells.corners, cells.sums, center, side, features)
     return features
 
 
@@ -314,10 +301,8 @@ def _features(x: Tensor) -> Tensor:
 
 DIMENSIONS = (1, 2, 3)
 
-_CUTS = {dim: FusedKernel("mixtures/piece_cuts.h", f"piece_cuts<{dim}>", shares=True) for dim in DIMENSIONS}
-_TEAM_CUTS = {
-    dim: FusedKernel("mixtures/piece_cuts.h", f"team_cuts<{dim}>", shares=True) for dim in DIMENSIONS
-}
+_CUTS = templated("mixtures/piece_cuts.h", "piece_cuts", DIMENSIONS, shares=True)
+_TEAM_CUTS = templated("mixtures/piece_cuts.h", "team_cuts", DIMENSIONS, shares=True)
 _MOST_ON_GPU = 1 << 12  # pieces: each is compared with all others
 
 
@@ -358,13 +343,13 @@ def piece_cuts(
     """
     n, width = features.shape
     most = n if rule.max_components < 0 else max(1, min(n, rule.max_components))
-    given = points.contiguous(), features.contiguous(), weight.contiguous(), n
+    given = points, features, weight, n
     if points.device.type != "cpu" or team is not None:
         return _team_cuts(given, rule, most, team)
     sizes = most * width, most * (2 * points.shape[1] + 2), most * 6, n
     work = points.new_empty(sum(sizes)).split(sizes)
     number, labels, n_pieces = torch.empty(most + n + 1, dtype=torch.int64).split((most, n, 1))
-    _CUTS[points.shape[1]](1, *given, *rule, *work, number, labels, n_pieces, device=points.device)
+    _CUTS[points.shape[1]](1, *given, *rule, *work, number, labels, n_pieces)
     return labels, int(n_pieces)
 
 
@@ -388,7 +373,7 @@ def _team_cuts(
     while True:
         phases = 1 if is_stepped else 1 << 62, before, after
         rows = *team, *given, *rule, scales, *work, *tables, *phases
-        _TEAM_CUTS[dim](team.n, *rows, device=device)
+        _TEAM_CUTS[dim](team.n, *rows)
         _, _, n_pieces, is_done = after.tolist()
         if is_done:
             return tables[-1], n_pieces

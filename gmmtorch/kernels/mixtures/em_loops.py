@@ -15,7 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, Team
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, Team, templated
 from gmmtorch.kernels.mixtures.em_steps import DIMENSIONS, Mixture, is_m_step_fused, lists_near_components
 
 MERGED = 256
@@ -29,27 +29,11 @@ _RUNNING, _ENDED, _IMPOSSIBLE, _PAUSED = range(4)  # states, as in `em_loops.h`
 _DECIDE = 14  # a phase of truncated EM, as there
 _PROGRESS = 16  # numbers of the progress of a run
 _HEAD = 2 * _PROGRESS
-_EXACT = {
-    (dim, wide): FusedKernel("mixtures/em_loops.h", f"exact_em<{dim}, {str(wide).lower()}>")
-    for dim, wide in itertools.product(DIMENSIONS, (False, True))
-}
-
-
-_TRUNCATED = {
-    (dim, wide): FusedKernel("mixtures/em_loops.h", f"truncated_em<{dim}, {str(wide).lower()}>")
-    for dim, wide in itertools.product(DIMENSIONS, (False, True))
-}
+_FORMS = list(itertools.product(DIMENSIONS, (False, True)))  # the last: for a CPU, whose rows are in lanes
+_EXACT = templated("mixtures/em_loops.h", "exact_em", _FORMS)
+_TRUNCATED = templated("mixtures/em_loops.h", "truncated_em", _FORMS)
 _SAMPLES = 64  # most rows of a group that are compared with all components
 _SORTED_PARTS, _MOST_COUNTS = 512, 1 << 22
-
-
-class Run(NamedTuple):
-    """A mixture, the bounds of the iterations that led to it, and whether the next iteration needs the twin,
-    which repairs a covariance, or takes a direct step."""
-
-    mixture: Mixture
-    bounds: list[float]
-    failed: bool
 
 
 def is_em_fused(features: Tensor, *others: Tensor) -> bool:
@@ -73,9 +57,12 @@ def fused_exact_em(
     last_bound: float = -math.inf,
     guarded: bool = False,
     team: Team | None = None,
-) -> Run:
+) -> tuple[Mixture, list[float], bool]:
     """Exact EM on features (N, F) of weight (N,) until the bound changes by less than `tol`, at first from
     `last_bound`. A launch has a limit, so a run may end before that and before `max_iter` (1 or more).
+
+    Returns the mixture, the bounds of the iterations, and whether the next one needs the twin, which repairs
+    a covariance, or takes a direct step.
 
     guarded: end also before an iteration whose natural parameters or statistics lose digits. team: other
     workers than those of the device; several on a CPU are launched for each phase.
@@ -89,26 +76,19 @@ def fused_exact_em(
     size, n_sums = k * (1 + dim + dim * dim), n_parts * padded * width
     near = n_parts * padded
     scratch = (2 * n, near * (CPU_LANES + 1), 2 * near) if wide else (n, 0, 0)
-    tables = (
-        k,
-        padded * width,
-        padded * width,
-        k * width + 2,
-        n_sums * (CPU_LANES if wide else 1),
-        *scratch,
-        1,
-    )
+    n_partial = n_sums * (CPU_LANES if wide else 1)
+    tables = k, padded * width, padded * width, k * width + 2, n_partial, *scratch, 1
     head, mixtures, masses, natural, table, *others = _carved(
         features, _HEAD + n_iter, 2 * size, *tables, 2 * team.n, 2 * MERGED, MERGED
     )
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
-    rows = features.contiguous(), weight.contiguous(), n, k, padded, n_parts
+    rows = features, weight, n, k, padded, n_parts
     limits = reg_covar, tol, last_bound, n_iter, guarded
     made = mixtures, masses, natural, table if lists else None, *others
     _launch(_EXACT[dim, wide], team, head, (*rows, *limits), made)
     (_, n_done, state, which, *_), bounds = _read(head)
     found = _mixture(mixtures[which * size :][:size].clone(), k, dim)
-    return Run(found, bounds[:n_done], state == _IMPOSSIBLE)
+    return found, bounds[:n_done], state == _IMPOSSIBLE
 
 
 class TruncatedRun(NamedTuple):
@@ -124,15 +104,6 @@ class TruncatedRun(NamedTuple):
     candidates: Tensor
 
 
-class TruncatedLimits(NamedTuple):
-    """Limits of a run: see `mixture.em.truncated.Settings`."""
-
-    reg_covar: float
-    tol: float
-    previous_bound: float
-    max_iter: int
-
-
 def n_sampled_rows(n_components: int) -> int:
     """Rows of a group that are compared with all components."""
     return max(8, min(_SAMPLES, 4096 // n_components))
@@ -143,7 +114,7 @@ def fused_truncated_em(
     weight: Tensor,
     owner: Tensor,
     start: Mixture,
-    limits: TruncatedLimits,
+    limits: tuple[float, float, float, int],
     candidates: Tensor | int,
     repaired: Callable[[Mixture], Tensor],
     summed: Callable[[Tensor], Tensor] | None = None,
@@ -154,6 +125,7 @@ def fused_truncated_em(
 
     Args:
         owner: (N,), the first ones. candidates: the first ones (K, m), or their number m.
+        limits: reg_covar, tol, previous_bound and max_iter of `mixture.em.truncated.Settings`.
         repaired: natural parameters (K, F), about the means, of a mixture with a covariance that is not
             positive definite. summed: sums a vector over the processes that share the fit.
         team: as in `fused_exact_em`.
@@ -165,7 +137,7 @@ def fused_truncated_em(
     )
     width, size, padded = 1 + dim + dim * (dim + 1) // 2, k * (1 + dim + dim * dim), k + -k % CPU_LANES
     n_samples, n_bounds = n_sampled_rows(k), _PAIRS_OF_A_LAUNCH[device.type] // (n * m)
-    n_bounds = max(1, min(limits.max_iter, n_bounds, _MOST_ITERATIONS))
+    n_bounds = max(1, min(limits[3], n_bounds, _MOST_ITERATIONS))
     n_parts = 1 if wide else max(1, min(_SORTED_PARTS, workers.n, _MOST_COUNTS // k))
     if wide:
         of_candidates = (m + -m % 4) * (CPU_LANES * (1 + width) + width)
@@ -180,7 +152,7 @@ def fused_truncated_em(
     )
     natural, statistics, flags, owners, groups = (others[i] for i in (1, 2, 8, 9, 12))
     torch.cat([part.reshape(-1) for part in start], out=mixtures[:size])
-    rows = values.contiguous(), weight.contiguous(), owner.contiguous(), first
+    rows = values, weight, owner, first
     given = *rows, n, columns == dim, k, m, n_samples, n_parts, *limits, n_bounds
     bounds: list[float] = []
     while True:
@@ -232,7 +204,7 @@ def _launch(
         n_phases = 1 if is_stepped else 1 << 62
         if team.arrived is not None:
             team.arrived.zero_()
-        kernel(team.n, *team, *given, n_phases, before, after, bounds, *tables, device=head.device)
+        kernel(team.n, *team, *given, n_phases, before, after, bounds, *tables)
         if not is_stepped or after[2]:
             return
         before.copy_(after)

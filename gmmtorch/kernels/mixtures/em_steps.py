@@ -10,19 +10,20 @@ With float32 exponentials a GPU computes in float32 within a block, from differe
 axes, whose rounding errors have a bound. If it can exceed 2⁻¹⁰ nats for a log-density, with thin components
 and rows far apart, or with cells rather than points, the block is computed in float64.
 
-The twins of the M-step (2.4)-(2.6) and of natural parameters are in `mixture.em`. The M-step differs from its
-twin by at most 10⁻¹² of the largest entry of a component, and natural parameters by this times the condition
-number of its covariance.
+The twins of the M-step (2.4)-(2.6) and of natural parameters are in `mixture.em`; docs/occupancy.md tells the
+differences.
 """
 
 from __future__ import annotations
+
+import itertools
 
 import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunk_elements, chunked
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, squad_size
+from gmmtorch.kernels.compiler import CPU_LANES, squad_size, templated
 from gmmtorch.linalg import order_along_curve
 
 _FEW_ROWS = 2048  # in fewer rows, their order matters little
@@ -35,15 +36,11 @@ _SQUAD_SUMS = 1 << 24  # most numbers of these sums, 128 MB
 
 _WIDTHS = {1: 3, 2: 6, 3: 10}
 _E_STEP = "mixtures/exact_e_step.h"
-_TABLES = {dim: FusedKernel("mixtures/near_components.h", f"component_table<{dim}>") for dim in _WIDTHS}
-_EXPECTATION = {dim: FusedKernel(_E_STEP, f"e_step<{dim}>") for dim in _WIDTHS}
-_MOST_LIKELY = {dim: FusedKernel(_E_STEP, f"most_likely<{dim}>") for dim in _WIDTHS}
-_KINDS = {torch.float32: "float", torch.float64: "double"}
-_IN_BLOCKS = {
-    (dim, dtype): FusedKernel(_E_STEP, f"e_step_in_blocks<{dim}, {kind}>")
-    for dim in _WIDTHS
-    for dtype, kind in _KINDS.items()
-}
+_TABLES = templated("mixtures/near_components.h", "component_table", _WIDTHS)
+_EXPECTATION = templated(_E_STEP, "e_step", _WIDTHS)
+_MOST_LIKELY = templated(_E_STEP, "most_likely", _WIDTHS)
+_TYPES = itertools.product(_WIDTHS, (torch.float32, torch.float64))
+_IN_BLOCKS = templated(_E_STEP, "e_step_in_blocks", _TYPES)
 _DIMENSIONS = {width: dim for dim, width in _WIDTHS.items()}
 
 
@@ -73,8 +70,7 @@ def most_likely(features: Tensor, natural: Tensor) -> Tensor:
         likeliest = torch.empty(n, dtype=torch.int64, device=device)
         n_parts = _n_parts(features) if device.type == "cpu" else n
         padded = _padded(natural, -len(natural) % 4)
-        given = features.contiguous(), n, padded, len(padded), n_parts
-        _MOST_LIKELY[dim](n_parts, *given, likeliest, device=device)
+        _MOST_LIKELY[dim](n_parts, features, n, padded, len(padded), n_parts, likeliest)
         return likeliest
     transposed = natural.T.contiguous()
     rows = max(64, chunk_elements(features.device) // transposed.shape[1])
@@ -113,7 +109,7 @@ def _n_parts(features: Tensor) -> int:
 def _padded(natural: Tensor, missing: int) -> Tensor:
     """W with rows of impossible components added, so that those of a step are complete."""
     if missing == 0:
-        return natural.contiguous()
+        return natural
     none = natural.new_zeros(missing, natural.shape[1])
     none[:, 0] = -1e300
     return torch.cat([natural, none])
@@ -123,7 +119,7 @@ def _table(natural: Tensor, n_padded: int) -> Tensor:
     """What bounds the components' logits (F, n_padded): see `component_table`."""
     table = natural.new_empty(natural.shape[1], n_padded)
     dim = _DIMENSIONS[natural.shape[1]]
-    _TABLES[dim](n_padded, natural, natural.shape[0], n_padded, table, device=natural.device)
+    _TABLES[dim](n_padded, natural, natural.shape[0], n_padded, table)
     return table
 
 
@@ -138,9 +134,9 @@ def _fused_expectation(features: Tensor, weight: Tensor, natural: Tensor) -> tup
     numbers = torch.empty(n_parts, 2, n_padded, dtype=torch.int64)
     partial = features.new_zeros(n_parts, n_padded, width, CPU_LANES)
     table = _table(padded, n_padded) if lists else None
-    given = features.contiguous(), weight.contiguous(), n, padded, table, k, n_padded, n_parts
+    given = features, weight, n, padded, table, k, n_padded, n_parts
     results = scratch, numbers, partial, peaks, norms
-    _EXPECTATION[_DIMENSIONS[width]](n_parts, *given, *results, device=features.device)
+    _EXPECTATION[_DIMENSIONS[width]](n_parts, *given, *results)
     return partial.sum((0, 3))[:k], torch.dot(weight, peaks + norms.log())
 
 
@@ -152,13 +148,13 @@ def _expectation_in_blocks(
     dim, device = _DIMENSIONS[width], features.device
     n_parts = max(1, min(_SQUADS, n // 64, _SQUAD_SUMS // (k * width)))
     n_padded = k + -k % CPU_LANES
-    natural, table = natural.contiguous(), _table(natural.contiguous(), n_padded)
+    table = _table(natural, n_padded)
     upper, norms = features.new_empty(n_parts, n_padded), features.new_empty(n)
     numbers = torch.empty(n_parts, n_padded, dtype=torch.int64, device=device)
     partial = features.new_zeros(n_parts, k, width)
-    given = features.contiguous(), weight.contiguous(), n, natural, table, k, n_padded, n_parts
+    given = features, weight, n, natural, table, k, n_padded, n_parts
     n_items = n_parts * squad_size(device)
-    _IN_BLOCKS[dim, dtype](n_items, *given, upper, numbers, partial, norms, device=device)
+    _IN_BLOCKS[dim, dtype](n_items, *given, upper, numbers, partial, norms)
     return partial.sum(0), torch.dot(weight, norms)
 
 
@@ -225,11 +221,9 @@ def exponent_floor(dtype: torch.dtype) -> float:
 
 DIMENSIONS: tuple[int, ...] = (1, 2, 3)
 
-_NATURALS = {dim: FusedKernel("mixtures/m_step.h", f"natural_parameters<{dim}>") for dim in DIMENSIONS}
-_STEPS = {dim: FusedKernel("mixtures/m_step.h", f"m_step<{dim}>") for dim in DIMENSIONS}
-_LABELLED = {
-    dim: FusedKernel("mixtures/m_step.h", f"label_moments<{dim}>", shares=True) for dim in DIMENSIONS
-}
+_NATURALS = templated("mixtures/m_step.h", "natural_parameters", DIMENSIONS)
+_STEPS = templated("mixtures/m_step.h", "m_step", DIMENSIONS)
+_LABELLED = templated("mixtures/m_step.h", "label_moments", DIMENSIONS, shares=True)
 
 Mixture = tuple[Tensor, Tensor, Tensor]
 """Weights (K,), means (K, D) and covariances (K, D, D)."""
@@ -250,8 +244,7 @@ def fused_natural_parameters(
     k, dim = covariances.shape[:2]
     natural = weights.new_empty(k, 1 + dim + dim * (dim + 1) // 2)
     failed = torch.zeros(1, dtype=torch.bool, device=weights.device)
-    given = weights.contiguous(), None if means is None else means.contiguous(), covariances.contiguous()
-    _NATURALS[dim](k, *given, natural, failed, device=weights.device)
+    _NATURALS[dim](k, weights, means, covariances, natural, failed)
     return natural, failed[0]
 
 
@@ -261,9 +254,9 @@ def fused_maximization(statistics: Tensor, dim: int, reg_covar: float, previous:
     made = statistics.new_empty(k * (1 + dim + dim * dim))
     masses, means = made[:k], made[k : k + k * dim].view(k, dim)
     covariances = made[k + k * dim :].view(k, dim, dim)
-    _, *kept = (None, None, None) if previous is None else (part.contiguous() for part in previous)
-    given = statistics.contiguous(), *kept, False, reg_covar, None, None, 0.0
-    _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4, device=statistics.device)
+    _, *kept = previous or (None, None, None)
+    given = statistics, *kept, False, reg_covar, None, None, 0.0
+    _STEPS[dim](k, *given, masses, means, covariances, *[None] * 4)
     return masses / masses.sum(), means, covariances
 
 
@@ -274,7 +267,7 @@ def fused_label_moments(
     k, width = n_labels, 1 + dim + dim * (dim + 1) // 2
     made = rows.new_zeros(k * (width + 1 + dim + dim * dim))
     sums, weights, means, covariances = made.split([k * width, k, k * dim, k * dim * dim])
-    given = rows.contiguous(), rows.shape[1] == dim, weight.contiguous(), labels.contiguous(), len(rows), k
+    given = rows, rows.shape[1] == dim, weight, labels, len(rows), k
     results = sums, weights, means, covariances
-    _LABELLED[dim](1, *given, reg_covar, *results, device=rows.device)
+    _LABELLED[dim](1, *given, reg_covar, *results)
     return weights, means.view(k, dim), covariances.view(k, dim, dim)

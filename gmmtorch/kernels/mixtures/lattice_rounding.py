@@ -11,14 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
-DIMENSIONS = (2, 3)
-
-_ROUNDINGS, _RESTORINGS = (
-    {dim: FusedKernel("mixtures/lattice.h", f"{name}<{dim}>", rounds_each=True) for dim in DIMENSIONS}
-    for name in ("lattice_rounding", "lattice_restoring")
-)
+_ROUNDINGS = templated("mixtures/lattice.h", "lattice_rounding", (2, 3), rounds_each=True)
+_RESTORINGS = templated("mixtures/lattice.h", "lattice_restoring", (2, 3), rounds_each=True)
 
 
 class LatticeConstants(NamedTuple):
@@ -56,10 +52,8 @@ def lattice_rounding(
     deviation, steps = axis_order.new_empty(n, dim), axis_order.new_empty(n, dim)
     shear = axis_order.new_empty(n, dim * (dim - 1) // 2)
     beyond = torch.zeros(1, dtype=torch.bool, device=means.device)
-    given = means.contiguous(), covariances.contiguous()
     made = axis_order, deviation, shear, steps
-    lattice = len(constants.orders), *constants
-    _ROUNDINGS[dim](n, *lattice, *given, *made, beyond, device=means.device)
+    _ROUNDINGS[dim](n, len(constants.orders), *constants, means, covariances, *made, beyond)
     return None if bool(beyond) else made
 
 
@@ -70,7 +64,6 @@ def lattice_restoring(
     n, dim = mean.shape
     means = torch.empty(n, dim, dtype=torch.float64, device=mean.device)
     covariances = means.new_empty(n, dim, dim)
-    places = [part.contiguous() for part in (axis_order, deviation, shear, mean)]
-    lattice = len(constants.orders), *constants
-    _RESTORINGS[dim](n, *lattice, *places, means, covariances, device=mean.device)
+    places = axis_order, deviation, shear, mean
+    _RESTORINGS[dim](n, len(constants.orders), *constants, *places, means, covariances)
     return means, covariances

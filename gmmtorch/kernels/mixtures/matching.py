@@ -1,8 +1,7 @@
 """Mixtures registered with mixtures, scans aligned with components or laid over a raster, explained points.
 
 The twin of `fused_registration` is in `localization.registration`, and that of `explained_points` in
-`mapping.learning.novelty`. The kernels differ from their twins by rounding: sums of alignment by at most
-10⁻¹¹ of their largest entry.
+`mapping.learning.novelty`.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from gmmtorch.errors import MemoryLimitError
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import FusedKernel, Team, templated
 from gmmtorch.kernels.evidence.point_evidence import Lists
 
 _KEPT = 4  # motions of a result at most
@@ -23,7 +22,7 @@ _ROW = 32  # numbers of a component in the work space, and of a climb
 _CLIMB = 256
 _PARTS = 256  # of the components of the source on a GPU; each part has its own sums
 _MOST_PAIRS = 1 << 26
-_REGISTRATIONS = {dim: FusedKernel("mixtures/registration.h", f"registration<{dim}>") for dim in (2, 3)}
+_REGISTRATIONS = templated("mixtures/registration.h", "registration", (2, 3))
 
 
 class Registered(NamedTuple):
@@ -65,7 +64,7 @@ def fused_registration(
     free = dim + dim * (dim - 1) // 2
     sizes = len(source[0]), len(target[0])
     tables = [
-        value.contiguous() for weights, means, covariances in (source, target)
+        value for weights, means, covariances in (source, target)
         for order in (means[:, 0].argsort(),)
         for value in (weights[order], means[order], covariances[order])
     ]  # fmt: skip
@@ -85,8 +84,8 @@ def fused_registration(
     coarsest, finest = (-1.0 if blur is None else blur for blur in blurs)
     _REGISTRATIONS[dim](
         team.n, *team, sizes[0], *tables[:3], sizes[1], *tables[3:], n_starts,
-        *(part.contiguous() for part in starts), by_area, coarsest, finest, *limits, n_parts, capacity,
-        space, whole, lists, found, device=device,
+        *starts, by_area, coarsest, finest, *limits, n_parts, capacity,
+        space, whole, lists, found,
     )  # fmt: skip
     found = found.cpu()
     n, n_evaluated, radius, *own, is_crowded = found[-6:].tolist()
@@ -105,8 +104,8 @@ def fused_registration(
 
 _AT_ONCE = 256  # motions, whose scores the twin computes
 _PARTS_OF_POINTS = 64  # of a motion on a GPU; each part has its own sums
-_ALIGNMENTS = {dim: FusedKernel("mixtures/point_alignment.h", f"alignment<{dim}>") for dim in (2, 3)}
-_SCORES = {dim: FusedKernel("mixtures/point_alignment.h", f"point_scores<{dim}>") for dim in (2, 3)}
+_ALIGNMENTS = templated("mixtures/point_alignment.h", "alignment", (2, 3))
+_SCORES = templated("mixtures/point_alignment.h", "point_scores", (2, 3))
 
 
 class NearLists(NamedTuple):
@@ -133,7 +132,7 @@ class NearLists(NamedTuple):
 
 
 _STRIPS = 16  # of the cells of each first coordinate on a GPU, which one worker fills
-_BOXES = {dim: FusedKernel("mixtures/point_alignment.h", f"box_lists<{dim}>") for dim in (2, 3)}
+_BOXES = templated("mixtures/point_alignment.h", "box_lists", (2, 3))
 
 
 def fused_box_lists(first: Tensor, last: Tensor, sizes: list[int], n_entries: int) -> Lists:
@@ -146,11 +145,9 @@ def fused_box_lists(first: Tensor, last: Tensor, sizes: list[int], n_entries: in
     totals = torch.empty(sizes[0] * n_strips, dtype=torch.int64, device=first.device)
     starts = torch.empty(math.prod(sizes) + 1, dtype=torch.int64, device=first.device)
     entries = torch.empty(n_entries, dtype=torch.int32, device=first.device)
-    team, boxes = Team.of(first.device), (first.contiguous(), last.contiguous(), len(first))
+    team, boxes = Team.of(first.device), (first, last, len(first))
     high = sizes[2] if len(sizes) == 3 else 1
-    _BOXES[first.shape[1]](
-        team.n, *team, *boxes, *sizes[:2], high, n_strips, totals, starts, entries, device=first.device
-    )
+    _BOXES[first.shape[1]](team.n, *team, *boxes, *sizes[:2], high, n_strips, totals, starts, entries)
     return Lists(starts, entries)
 
 
@@ -209,11 +206,10 @@ def fused_alignment(
     width = sum(parts) + dim * dim + dim + n_sums + 2
     n_parts = 1 if points.device.type == "cpu" else _PARTS_OF_POINTS
     space = points.new_empty(n * (width + n_parts * n_sums))
-    given = [part.contiguous() for part in (points, *motions)]
     team = Team.of(points.device)
     _ALIGNMENTS[dim](
-        team.n, *team, given[0], len(points), n_parts, n, *given[1:], *table.lists, *table[1:],
-        settled, max_steps, space, device=points.device,
+        team.n, *team, points, len(points), n_parts, n, *motions, *table.lists, *table[1:],
+        settled, max_steps, space,
     )  # fmt: skip
     rows = space[: n * width].view(n, width)[:, : sum(parts)]
     turn, shift, score, n_explained, gradient, *information, is_settled = rows.split(parts, 1)
@@ -230,8 +226,7 @@ def alignment_scores(points: Tensor, motions: tuple[Tensor, Tensor], table: Alig
         parts = [tuple(part[some] for part in motions) for some in rows]
         return torch.cat([_batched_alignment(points, (turn, shift), table).score for turn, shift in parts])
     scores = points.new_empty(n)
-    given = [part.contiguous() for part in (points, *motions)]
-    _SCORES[dim](n, given[0], len(points), *given[1:], *table.lists, *table[1:], scores, device=points.device)
+    _SCORES[dim](n, points, len(points), *motions, *table.lists, *table[1:], scores)
     return scores
 
 
@@ -268,8 +263,6 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
     Args:
         cells: (H, N, 3) int64, of N points under each of H headings. heading: (C,) int64, and shift: (C, 3)
             int64, of each placement. raster: (nx, ny, nz) float32. outside: value of cells outside it.
-
-    The fused kernel differs from its twin by rounding.
     """
     if is_fused(cells, heading, shift, raster):
         return fused_bounds(cells, heading, shift, raster, outside, _NO_PRIOR)
@@ -290,9 +283,8 @@ def fused_bounds(
 ) -> Tensor:
     """`raster_sums` less the nats against placements by a prior. `localization.pose_search` has the twin."""
     sums = torch.empty(len(heading), dtype=torch.float64, device=cells.device)
-    given = [part.contiguous() for part in (heading, shift, raster)]
-    counts = *raster.shape, outside, *prior
-    _RASTER(len(heading), cells.contiguous(), cells.shape[1], *given, *counts, sums, device=cells.device)
+    given = cells, cells.shape[1], heading, shift, raster, *raster.shape
+    _RASTER(len(heading), *given, outside, *prior, sums)
     return sums
 
 
@@ -346,9 +338,7 @@ def _arms(lever: Tensor) -> Tensor:
     return torch.stack(columns, 2)
 
 
-_EXPLAINED = {
-    dim: FusedKernel("mixtures/explained_points.h", f"explained_points<{dim}>", shares=True) for dim in (2, 3)
-}
+_EXPLAINED = templated("mixtures/explained_points.h", "explained_points", (2, 3), shares=True)
 
 
 def explained_points(
@@ -370,14 +360,11 @@ def explained_points(
         means: (K, D), whitening: (K, D, D), lower triangular, float64; see `occupancy.cones.whitening`.
         near: (K,) bool, frees: (N,) bool: components that are not near explain no point that frees space.
             frees=None: no point does.
-
-    The fused kernel differs from its twin by rounding.
     """
     k, dim = means.shape
-    table = torch.cat([means.T, whitening.flatten(1).T]).contiguous()
+    table = torch.cat([means.T, whitening.flatten(1).T])
     gained = torch.zeros(k, dtype=torch.float64, device=points.device)
     found = torch.empty(len(points), dtype=torch.bool, device=points.device)
-    frees = None if frees is None else frees.contiguous()
-    given = (table, k, near.contiguous(), limit, least, gained, found)
-    _EXPLAINED[dim](len(points), points.double().contiguous(), frees, *given, device=points.device)
+    given = points.double(), frees, table, k, near, limit, least
+    _EXPLAINED[dim](len(points), *given, gained, found)
     return gained, found

@@ -1,7 +1,7 @@
-"""Mixtures reduced in rounds of merges; the twin is `mixture.reduction`.
+"""Mixtures reduced in rounds of merges, as in `mixture.reduction`; and the choice of the viewpoints that
+components keep, as in `mapping.learning.merging`.
 
-One launch does all rounds. Its merges equal the twin's to the bit, if the same pairs are merged; costs differ
-by rounding.
+One launch does all rounds.
 """
 
 from __future__ import annotations
@@ -11,12 +11,9 @@ import math
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel, Team
+from gmmtorch.kernels.compiler import Team, templated
 
-_MERGES = {
-    dim: FusedKernel("mixtures/pair_merges.h", f"pair_merges<{dim}>", shares=True, rounds_each=True)
-    for dim in range(2, 7)  # with attributes up to three more than those of space
-}
+_MERGES = templated("mixtures/pair_merges.h", "pair_merges", range(2, 7), shares=True, rounds_each=True)
 SELECTION_COUNTS = 16 * 256
 """Counts by which a team finds the smallest numbers, as in `selection.h`."""
 
@@ -45,8 +42,8 @@ def pair_merges(
     not positive definite, or its determinant is beyond 10^±280.
     """
     k, dim = means.shape
-    given = order, weights.contiguous(), means.contiguous(), covariances.contiguous()
-    made = torch.empty_like(given[1]), torch.empty_like(given[2]), torch.empty_like(given[3])
+    given = weights, means, covariances
+    made = weights.new_empty(k), weights.new_empty(k, dim), weights.new_empty(k, dim, dim)
     members, lead = torch.empty_like(order), torch.empty_like(order)
     block = 8 * max(4, math.isqrt(k) // 8)  # about as many blocks as rows in each
     scratch = weights.new_empty((k + 2 * block) * (3 + 3 * dim + dim**2 + 2 * neighbors))
@@ -56,7 +53,32 @@ def pair_merges(
     team = Team.of(order.device)
     rule = least, limit, is_hellinger, neighbors, block
     _MERGES[dim](
-        team.n, *team, k, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
-        device=order.device,
+        team.n, *team, k, order, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
     )  # fmt: skip
     return None if bool(failed) else (lead, members, made)
+
+
+_CHOICES = templated("mixtures/viewpoint_choice.h", "viewpoint_choice", (2, 3), shares=True, rounds_each=True)
+
+
+def viewpoint_choice(
+    by: Tensor, seen_from: Tensor, count: Tensor, origins: Tensor, support: Tensor, most: int, limit: int
+) -> tuple[Tensor, Tensor | None, bool]:
+    """Choose at most `most` of the viewpoints (E,) of each of K components, and at most `limit` in all.
+
+    by, seen_from, count (E,), origins (S, D), support (K,): as in `Components`.
+
+    Returns counts (E,), those of the chosen ones scaled to add up to the support; the rows of the chosen ones
+    (J,), None for all; and whether it is known that every origin has one.
+    """
+    device, (n_origins, dim), e = by.device, origins.shape, len(by)
+    given = by.argsort(stable=True), by, seen_from, count, origins
+    gain, nearest, scaled = torch.empty(3, e, dtype=count.dtype, device=device)
+    flags = torch.zeros(e + n_origins, dtype=torch.bool, device=device)
+    counts = torch.zeros(SELECTION_COUNTS + 2, dtype=torch.int32, device=device)
+    team, is_kept = Team.of(device), flags[:e]
+    choice = gain, nearest, scaled, is_kept, flags[e:], counts[SELECTION_COUNTS:]
+    sizes, table = (len(support), e), (n_origins, support)
+    _CHOICES[dim](team.n, *team, *sizes, *given, *table, *choice, most, limit, counts)
+    n_kept, n_used = counts[SELECTION_COUNTS:].tolist()
+    return scaled, None if n_kept == e else is_kept.nonzero().squeeze(1), n_used == n_origins

@@ -50,14 +50,14 @@ def fused_kmeans(
     n_padded, done = padded.shape[1], torch.zeros(n_runs, dtype=torch.bool)
     scratch = points.new_empty(dim * CPU_LANES + n_padded * (dim + 2))
     nearest, distance = torch.empty(n_runs, n, dtype=torch.int64), points.new_empty(n_runs, n)
-    given = points.contiguous(), weight.contiguous(), n, dim, k, n_padded
+    given = points, weight, n, dim, k, n_padded
     results = least_shift, padded, scratch, nearest, distance, done
     n_steps = max(1, _PRODUCTS_OF_A_LAUNCH // (n_runs * n * k * dim))
     for begin in range(0, max_iter, n_steps):
-        _LLOYD(n_runs, *given, min(n_steps, max_iter - begin), *results, device=points.device)
+        _LLOYD(n_runs, *given, min(n_steps, max_iter - begin), *results)
         if bool(done.all()):
             break
-    _LLOYD(n_runs, *given, 0, *results, device=points.device)
+    _LLOYD(n_runs, *given, 0, *results)
     return nearest, distance
 
 
@@ -114,14 +114,14 @@ def fused_em(
     scratch = points.new_empty(n_vectors * CPU_LANES + dim * dim + k * (dim + 3) * dim + k)
     counts, entropy = torch.empty_like(weights), points.new_empty(n_runs)
     last, state = points.new_full((n_runs,), last_bound), torch.zeros(n_runs, dtype=torch.int64)
-    given = points.contiguous(), weight.contiguous(), n, dim, k, _KINDS.index(kind), reg_covar, tol
+    given = points, weight, n, dim, k, _KINDS.index(kind), reg_covar, tol
     found: list[list[float]] = [[] for _ in range(n_runs)]
     stopped, most = [0], max(1, _PRODUCTS_OF_A_LAUNCH // (n_runs * n * k * n_sums))
     while not all(stopped) and len(found[stopped.index(0)]) < max_iter:
         n_steps = min(most, max_iter - max(map(len, found)))
         bounds, n_done = points.new_empty(n_runs, n_steps), torch.empty(n_runs, dtype=torch.int64)
         results = counts, weights, means, covariances, last, bounds, entropy, n_done, state
-        _EM(n_runs, *given, n_steps, log_weights, labels, scratch, *results, device=points.device)
+        _EM(n_runs, *given, n_steps, log_weights, labels, scratch, *results)
         if labels is not None:
             break
         for run, (row, done) in enumerate(zip(bounds.tolist(), n_done.tolist(), strict=True)):

@@ -66,10 +66,7 @@ def information_by_block(
         cameras: (V, 3) int64, the cells of the cameras; a camera outside sees nothing.
         yaw: (V,) int64, the headings.
         shannon_information: Shannon information (FSMI) instead of CSQMI.
-
-    The fused kernel differs from its twin by at most 10⁻⁴ of the largest gain of a view.
     """
-    cameras, yaw = cameras.contiguous(), yaw.contiguous()
     if is_fused(cells.occupancy, beams.volumes, cameras, yaw):
         return _fused(beams, cells, cameras, yaw, shannon_information)
     return _batched(beams, cells, cameras, yaw, shannon_information)
@@ -88,33 +85,13 @@ def _fused(
     n_own = beams.per_view if device.type == "cpu" else 1
     n_items = n_views * beams.per_view // n_own
     gain, taken = torch.zeros(2, n_views, cells.n_blocks, device=device)
-    _KERNEL(
-        n_items,
-        cameras,
-        yaw,
-        *cells.shape,
-        beams.per_view,
-        n_own,
-        n_templates,
-        n_columns,
-        beams.leading.shape[-1],
-        len(beams.kernel),
-        cells.n_blocks,
-        beams.lengths,
-        beams.leading,
-        beams.ahead,
-        beams.volumes,
-        beams.kernel,
-        cells.offsets,
-        cells.occupancy,
-        cells.block,
-        shannon_information,
-        math.log(IMAGE_ODDS),
-        torch.empty(n_items, 6, n_columns, device=device),
-        gain,
-        taken,
-        device=device,
-    )
+    sizes = beams.per_view, n_own, n_templates, n_columns, beams.leading.shape[-1], len(beams.kernel)
+    tables = beams.lengths, beams.leading, beams.ahead, beams.volumes, beams.kernel
+    places = cells.offsets, cells.occupancy, cells.block
+    rule = shannon_information, math.log(IMAGE_ODDS)
+    made = torch.empty(n_items, 6, n_columns, device=device), gain, taken
+    given = *cells.shape, *sizes, cells.n_blocks
+    _KERNEL(n_items, cameras, yaw, *given, *tables, *places, *rule, *made)
     return gain, taken
 
 

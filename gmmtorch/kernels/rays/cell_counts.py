@@ -1,6 +1,5 @@
 """Cells of dense blocks and of sparse stores: listed with their counts, found, and added to; and their
-entropy:
-what additions of evidence remove from it, and what one beam would remove.
+entropy: what additions of evidence remove from it, and what one beam would remove.
 """
 
 from __future__ import annotations
@@ -47,15 +46,15 @@ def list_counted_cells(low: Tensor, hits: Tensor, misses: Tensor) -> tuple[Tenso
         cells = cells[((x * n_blocks[1] + y) * n_blocks[2] + z).argsort(stable=True)]
         some = [counts[cells.unbind(1)].float() for counts in (hits, misses)]
         return cells + low, some[0], some[1]
-    given = *hits.shape, *n_blocks[1:], _BLOCK_BITS, hits.contiguous(), misses.contiguous(), low.contiguous()
+    given = *hits.shape, *n_blocks[1:], _BLOCK_BITS, hits, misses, low
     n_items = math.prod(n_blocks)
     in_block = torch.empty(n_items, dtype=torch.int64, device=device)
-    _LIST(n_items, *given, in_block, None, None, None, device=device)
+    _LIST(n_items, *given, in_block, None, None, None)
     until = torch.cumsum(in_block, 0)
     n = int(until[-1])
     cells = torch.empty(n, 3, dtype=torch.int64, device=device)
     listed = torch.empty(2, n, device=device)
-    _LIST(n_items, *given, until - in_block, cells, listed[0], listed[1], device=device)
+    _LIST(n_items, *given, until - in_block, cells, listed[0], listed[1])
     return cells, listed[0], listed[1]
 
 
@@ -64,15 +63,12 @@ def add_counts(counts: Tensor, index: Tensor, hits: Tensor, misses: Tensor) -> t
 
     Args:
         counts: contiguous, changed in place. index: (C,) int64, flat in counts[0]; nothing is added at 0.
-
-    The fused kernel, for float32, and its twin give equal counts.
     """
     n = len(index)
     if is_fused(counts, index, hits, misses) and counts.dtype == hits.dtype == misses.dtype == torch.float32:
         before = torch.empty(2, n, device=counts.device)
         run = _RUN if counts.device.type == "cpu" else 1
-        more = index.contiguous(), hits.contiguous(), misses.contiguous()
-        _ADD(-(-n // run), n, run, *more, counts[0].numel(), counts, before, device=counts.device)
+        _ADD(-(-n // run), n, run, index, hits, misses, counts[0].numel(), counts, before)
         return before[0], before[1]
     inside = index > 0
     olds = [part.view(-1).index_select(0, index) for part in counts]
@@ -91,8 +87,7 @@ def flags_of_cells(cells: Tensor, low: Tensor, flags: Tensor) -> Tensor:
     if is_fused(cells, low, flags):
         n, found = len(cells), torch.empty_like(cells[:, 0], dtype=torch.bool)
         run = _RUN if cells.device.type == "cpu" else 1
-        given = cells.contiguous(), low.contiguous(), nx, ny, nz, flags.contiguous()
-        _FLAGS(-(-n // run), n, run, *given, found, device=cells.device)
+        _FLAGS(-(-n // run), n, run, cells, low, nx, ny, nz, flags, found)
         return found
     x, y, z = (cells - low).unbind(1)
     inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & (z >= 0) & (z < nz)
@@ -115,21 +110,13 @@ class BlockKeys(NamedTuple):
 
 
 def cell_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
-    """Flat index (C,) int64 of cells (C, D) in the slots; −1 in blocks that are not stored, 0 out of bounds.
-
-    The fused kernel and its twin give equal indices.
-    """
+    """Flat index (C,), int64, of cells (C, D) in the slots; −1 in blocks not stored, 0 out of bounds."""
     if is_fused(cells, blocks.keys, blocks.bounds):
         run = _INDEX_RUN if cells.device.type == "cpu" else 1
         index, (n, dim) = torch.empty_like(cells[:, 0]), cells.shape
-        table = (
-            blocks.keys.contiguous(),
-            blocks.slots.contiguous(),
-            len(blocks.keys),
-            blocks.bounds.contiguous(),
-        )
+        table = blocks.keys, blocks.slots, len(blocks.keys), blocks.bounds
         bits = blocks.local_bits, blocks.axis_bits
-        _INDEX(-(-n // run), cells.contiguous(), n, dim, run, *table, *bits, index, device=cells.device)
+        _INDEX(-(-n // run), cells, n, dim, run, *table, *bits, index)
         return index
     return _batched_index(cells, blocks)
 
@@ -158,50 +145,34 @@ def _batched_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
     return torch.where(inside, torch.where(first < 0, -1, first + place), 0)
 
 
-_CHUNK_VISITS = 1 << 16  # of the twin: fastest when cores share a cache
-
-
-class Removed(NamedTuple):
-    """Bits removed from all cells and from the chosen ones; chosen cells without evidence before."""
-
-    bits: float
-    chosen_bits: float
-    n_new: int
-
-
 _REMOVED = FusedKernel("rays/cell_entropy.h", "entropy_removed")
 _ALONG = FusedKernel("rays/cell_entropy.h", "reduction_along_rays")
 
 
 def entropy_removed(
     before: tuple[Tensor, Tensor], added: tuple[Tensor, Tensor], chosen: Tensor, prior: float, clamp: float
-) -> Removed:
-    """Sums, over cells, of the entropy that an addition of evidence removes.
+) -> tuple[float, float, int]:
+    """Bits of entropy that an addition of evidence removes from all cells and from the chosen ones; and how
+    many of the chosen ones had no evidence.
 
     Args:
         before, added: hits (C,) and misses (C,), float32. chosen: (C,) bool.
         prior: N_p, rays. clamp: probabilities stay within [clamp, 1 − clamp].
-
-    The fused kernel differs from its twin by at most 10⁻⁶ bits for each cell.
     """
     if is_fused(*before, *added, chosen) and before[0].dtype == torch.float32:
         n = len(chosen)
         sums = torch.empty(-(-n // _RUN), 3, dtype=torch.float64, device=chosen.device)
-        values = [value.contiguous() for value in (*before, *added, chosen)]
-        _REMOVED(len(sums), n, _RUN, *values, prior, clamp, sums, device=chosen.device)
+        _REMOVED(len(sums), n, _RUN, *before, *added, chosen, prior, clamp, sums)
         bits, chosen_bits, n_new = sums.sum(0).tolist()
-        return Removed(bits, chosen_bits, int(n_new))
+        return bits, chosen_bits, int(n_new)
     (h, m), (more_h, more_m) = before, added
 
     def entropy(hits: Tensor, misses: Tensor) -> Tensor:
         return bernoulli_entropy(occupancy_probability(hits, misses, prior).clamp(clamp, 1 - clamp))
 
     gone = entropy(h, m) - entropy(h + more_h, m + more_m)
-    return Removed(
-        float(gone.sum(dtype=torch.float64)),
-        float(gone[chosen].sum(dtype=torch.float64)),
-        int((h + m == 0)[chosen].sum()),
-    )
+    bits, chosen_bits = (float(part.sum(dtype=torch.float64)) for part in (gone, gone[chosen]))
+    return bits, chosen_bits, int((h + m == 0)[chosen].sum())
 
 
 def reduction_along_rays(
@@ -231,15 +202,14 @@ def reduction_along_rays(
         hits, misses = (torch.nn.functional.pad(counts, (margin,) * 6) for counts in (hits, misses))
         rays = rays_argument(starts.double(), stops.double(), shape, row_major_strides(shape), low)
         sums = torch.empty(len(starts), dtype=torch.float64, device=starts.device)
-        counts = hits.contiguous(), misses.contiguous()
-        _ALONG(len(starts), *rays, *counts, prior, observed, mark, table, sums, device=starts.device)
+        _ALONG(len(starts), *rays, hits, misses, prior, observed, mark, table, sums)
         return sums
     h, m = hits.double(), misses.double()
     bits = cell_entropy(h, m, prior) - cell_entropy(h, m + 1, prior) + mark * (h + m < observed)
     table = torch.nn.functional.pad(bits, (margin,) * 6).view(-1)
     sums = torch.zeros(len(starts), dtype=torch.float64, device=starts.device)
-    for visit in traverse(starts, stops, shape, _CHUNK_VISITS, low=low):
-        sums.index_add_(0, visit.ray, table.index_select(0, visit.voxel))
+    for voxel, ray in traverse(starts, stops, shape, low=low):
+        sums.index_add_(0, ray, table.index_select(0, voxel))
     return sums
 
 

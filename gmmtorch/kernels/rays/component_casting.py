@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,14 +24,6 @@ _FARTHEST_DRAW = 11.0  # deviations: an upper bound of every draw, because quant
 _PARTS = 32  # items that share a viewpoint on CUDA
 
 
-class Seen(NamedTuple):
-    """C viewpoints: rows (C,) of the components and of their origins, int64, and counts (C,) float64."""
-
-    component: Tensor
-    origin: Tensor
-    rays: Tensor
-
-
 _CAST = FusedKernel("rays/component_casting.h", "cast_components", shares=True)
 
 
@@ -42,7 +33,7 @@ def cast_components(
     origins: Tensor,
     max_range: Tensor,
     ids: Tensor,
-    seen: Seen,
+    seen: tuple[Tensor, Tensor, Tensor],
     bounds: Tensor,
     *,
     resolution: float,
@@ -58,7 +49,8 @@ def cast_components(
 
     Args:
         means: (K, 3), covariances: (K, 3, 3), origins: (V, 3), metres, float64. max_range: (K,) bool.
-        ids: (K, 2) int64.
+        ids: (K, 2) int64. seen: C viewpoints: rows (C,) of the components and of their origins, int64, and
+            counts (C,), float64.
         bounds: (4, 3) float64, lowest and highest cell of the box whose rays count, and of the window.
         rays_per_cell, cutoff: of components of surfaces, and of those of no-return beams.
         shell: metres before a component's surface that rays do not count as free.
@@ -72,31 +64,11 @@ def cast_components(
     failed = torch.zeros(1, dtype=torch.bool, device=device)
     parts = 1 if device.type == "cpu" else _PARTS
     points = sobol_points(most * hits_per_ray, str(device))
-    _CAST(
-        len(seen.rays) * parts,
-        *(value.contiguous() for value in (means, covariances, origins, max_range, ids, *seen)),
-        points,
-        points.shape[1],
-        _shrinkages(cutoff, str(device)),
-        _RADII + 2,
-        _RADII / _FARTHEST_DRAW,
-        bounds.contiguous(),
-        parts,
-        resolution,
-        TIE,
-        torch.tensor(rays_per_cell, dtype=torch.float64, device=device),
-        least,
-        most,
-        torch.tensor(cutoff, dtype=torch.float64, device=device),
-        EFFECTIVE_AREA,
-        shell,
-        hits_per_ray,
-        THINNING if thinned else 0,
-        hits,
-        misses,
-        failed,
-        device=device,
-    )
+    table = _shrinkages(cutoff, str(device)), _RADII + 2, _RADII / _FARTHEST_DRAW
+    per_cell, ends = (means.new_tensor(pair) for pair in (rays_per_cell, cutoff))
+    given = means, covariances, origins, max_range, ids, *seen, points, points.shape[1], *table, bounds
+    rule = per_cell, least, most, ends, EFFECTIVE_AREA, shell, hits_per_ray, THINNING if thinned else 0
+    _CAST(len(seen[0]) * parts, *given, parts, resolution, TIE, *rule, hits, misses, failed)
     return None if bool(failed) else (hits, misses)
 
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import templated
 
-_VIEWS = {dim: FusedKernel("rays/range_views.h", f"range_views<{dim}>") for dim in (2, 3)}
+_VIEWS = templated("rays/range_views.h", "range_views", (2, 3))
 
 
 def range_views(
@@ -35,11 +35,7 @@ def range_views(
     """
     n, dim = motions[1].shape
     counts = points.new_empty(n, 2)
-    given = [part.contiguous() for part in (*motions, *frames)]
-    nearest, farthest = (image.contiguous() for image in images)
-    shown = len(nearest), nearest, farthest
-    _VIEWS[dim](
-        n, points.T.contiguous(), len(points), *given, *shown, *size, *limits, counts, device=points.device
-    )
+    given = points.T, len(points), *motions, *frames, len(images[0]), *images
+    _VIEWS[dim](n, *given, *size, *limits, counts)
     free, unknown = counts.unbind(1)
     return free, unknown

@@ -27,21 +27,17 @@ from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
 from gmmtorch.kernels.chunks import chunked
-from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel, templated
 
 _SOURCE = "rays/ray_counting.h"
 TIE = 1e-13
 """Distance of crossings that count as one point, relative to the terms: a few hundred times their rounding
 error."""
-CHUNK_VISITS = 1 << 18
-"""Voxel visits in one pass: they fit a core's cache."""
+_CHUNK_VISITS = 1 << 18  # visits in one pass: they fit a core's cache
 
 
-class Visits(NamedTuple):
-    """Voxels that rays leave: flat voxel index (V,) and ray index (V,), both int64."""
-
-    voxel: Tensor
-    ray: Tensor
+Visits = tuple[Tensor, Tensor]
+"""Voxels that rays leave: flat voxel index (V,) and ray index (V,), both int64."""
 
 
 class _Rays(NamedTuple):
@@ -140,7 +136,7 @@ def _crossings(rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: in
             inside &= (index >= 0) & (index < shape[other])
         voxel = torch.addcmul(voxel, index, each(signed[:, other]))
     voxel = voxel.long()
-    return Visits(voxel[inside], ray[inside]) if masked else Visits(voxel, ray)
+    return (voxel[inside], ray[inside]) if masked else (voxel, ray)
 
 
 def _slack(rays: _Rays, axis: int, other: int) -> Tensor:
@@ -166,7 +162,7 @@ def traverse(
     starts: Tensor,
     ends: Tensor,
     shape: tuple[int, ...],
-    chunk_visits: int = CHUNK_VISITS,
+    chunk_visits: int = _CHUNK_VISITS,
     strides: list[int] | None = None,
     low: Tensor | None = None,
 ) -> Iterator[Visits]:
@@ -187,10 +183,19 @@ def traverse(
         return
     starts, ends = starts.double(), ends.double()
     strides = strides or row_major_strides(shape)
-    if is_fused(starts, ends, low):
-        yield from _fused(starts, ends, shape, chunk_visits, strides, low)
-    else:
+    if not is_fused(starts, ends, low):
         yield from _batched(starts, ends, shape, chunk_visits, strides, low)
+        return
+    rays, device = rays_argument(starts, ends, shape, strides, low), starts.device
+    counts = torch.empty(len(starts), dtype=torch.int64, device=device)
+    _COUNT_VISITS(len(starts), *rays, counts)
+    stops = torch.cumsum(counts, 0)
+    cuts = _chunk_bounds(counts, chunk_visits)
+    sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
+    for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
+        if after > before:
+            listed = functools.partial(_listed, rays, stops, {begin: before, stop: after}, begin)
+            yield from chunked(stop - begin, stop - begin, listed)
 
 
 def rays_argument(
@@ -203,34 +208,13 @@ def rays_argument(
 ) -> list[Tensor | float]:
     """The fields of `Rays` of `ray_walk.h`. unit: 1/n if n finer voxels make a voxel and ties are theirs."""
     dim = len(shape)
-    low = starts.new_zeros(dim) if low is None else low.double().contiguous()
+    low = starts.new_zeros(dim) if low is None else low.double()
     sizes, pad = [*shape, *[1] * (3 - dim)], [0] * (3 - dim)
-    return [starts.contiguous(), ends.contiguous(), low, dim, *sizes, *strides, *pad, TIE, unit]
+    return [starts, ends, low, dim, *sizes, *strides, *pad, TIE, unit]
 
 
 _COUNT_VISITS = FusedKernel(_SOURCE, "count_visits")
 _LIST_VISITS = FusedKernel(_SOURCE, "list_visits")
-
-
-def _fused(
-    starts: Tensor,
-    ends: Tensor,
-    shape: tuple[int, ...],
-    chunk_visits: int,
-    strides: list[int],
-    low: Tensor | None,
-) -> Iterator[Visits]:
-    device = starts.device
-    rays = rays_argument(starts, ends, shape, strides, low)
-    counts = torch.empty(starts.shape[0], dtype=torch.int64, device=device)
-    _COUNT_VISITS(starts.shape[0], *rays, counts, device=device)
-    stops = torch.cumsum(counts, 0)
-    cuts = _chunk_bounds(counts, chunk_visits)
-    sizes = stops[torch.tensor(cuts[1:], device=device) - 1].tolist()
-    for begin, stop, before, after in zip(cuts, cuts[1:], [0, *sizes], sizes, strict=False):
-        if after > before:
-            listed = functools.partial(_listed, rays, stops, {begin: before, stop: after}, begin)
-            yield from chunked(stop - begin, stop - begin, listed)
 
 
 def _listed(
@@ -239,9 +223,9 @@ def _listed(
     """Visits of a run of rays; `known`: how many visits come before a ray, where Python has this number."""
     first, last = begin + part.start, begin + part.stop
     before, after = (known[ray] if ray in known else int(stops[ray - 1]) for ray in (first, last))
-    visits = Visits(*torch.empty(2, after - before, dtype=torch.int64, device=stops.device))
-    _LIST_VISITS(last - first, first, stops, *visits, *rays, device=stops.device)
-    return visits
+    voxel, ray = torch.empty(2, after - before, dtype=torch.int64, device=stops.device)
+    _LIST_VISITS(last - first, first, stops, voxel, ray, *rays)
+    return voxel, ray
 
 
 def _batched(
@@ -263,23 +247,17 @@ def _batched(
         masked = not bool(fits[begin:stop].all())
         for axis in range(len(shape)):
             crossings = functools.partial(_crossings_of, rays, begin, shape, strides, axis, masked)
-            yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found.voxel))
+            yield from (found for found in chunked(stop - begin, stop - begin, crossings) if len(found[0]))
 
 
 def _crossings_of(
-    rays: _Rays,
-    begin: int,
-    shape: tuple[int, ...],
-    strides: list[int],
-    axis: int,
-    masked: bool,
-    part: slice,
+    rays: _Rays, begin: int, shape: tuple[int, ...], strides: list[int], axis: int, masked: bool, part: slice
 ) -> Visits:
     """`_crossings` of a run of rays that starts at `begin`."""
     first, last = begin + part.start, begin + part.stop
     some = _Rays(*(field[first:last] for field in rays))
-    found = _crossings(some, shape, strides, axis, masked)
-    return Visits(found.voxel, found.ray + first if first else found.ray)
+    voxel, ray = _crossings(some, shape, strides, axis, masked)
+    return voxel, ray + first if first else ray
 
 
 def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:
@@ -289,17 +267,11 @@ def _chunk_bounds(visits: Tensor, chunk_visits: int) -> list[int]:
     return [0, *cuts.tolist(), visits.shape[0]]
 
 
-_IN_GRID = {
-    dtype: FusedKernel(_SOURCE, f"count_rays_in_grid<{kind}>", shares=True)
-    for dtype, kind in ((torch.float64, "double"), (torch.int32, "int32_t"))
-}
+_IN_GRID = templated(_SOURCE, "count_rays_in_grid", (torch.float64, torch.int32), shares=True)
 _CELLS_A_RAY = 16
 """For more rays than a grid has cells / 16, a GPU counts in whole numbers of half the size, which fit better
 into its cache, and adds these to the counts."""
-_IN_BLOCKS = {
-    dtype: FusedKernel(_SOURCE, f"count_rays_in_blocks<{kind}>", shares=True)
-    for dtype, kind in ((torch.float64, "double"), (torch.float32, "float"))
-}
+_IN_BLOCKS = templated(_SOURCE, "count_rays_in_blocks", (torch.float64, torch.float32), shares=True)
 _MARK = FusedKernel(_SOURCE, "mark_rays")
 _MARK_BITS = FusedKernel(_SOURCE, "mark_cells_of_rays")
 
@@ -310,9 +282,7 @@ def count_in_grid(
     ends: Tensor,
     shape: tuple[int, ...],
     weights: Tensor | None = None,
-    *,
     low: Tensor | None = None,
-    chunk_visits: int = CHUNK_VISITS,
 ) -> None:
     """Add the weight of each ray to `counts`, a dense grid, at every voxel that it leaves.
 
@@ -320,9 +290,8 @@ def count_in_grid(
         counts: (voxels,) float64, row-major.
         starts, ends, shape, low: see `traverse`.
         weights: (R,); ones if not given.
-        chunk_visits: of the twin, see `traverse`.
     """
-    weights = None if weights is None else weights.double().contiguous()
+    weights = None if weights is None else weights.double()
     starts, ends = starts.double(), ends.double()
     if is_fused(counts, starts, ends, weights, low):
         rays = rays_argument(starts, ends, shape, row_major_strides(shape), low)
@@ -330,14 +299,13 @@ def count_in_grid(
         many = is_gpu and weights is None and counts.numel() < _CELLS_A_RAY * n_rays < _CELLS_A_RAY << 31
         added = torch.zeros_like(counts, dtype=torch.int32) if many else counts
         n_items = _n_items(n_rays, counts.device)
-        _IN_GRID[added.dtype](n_items, n_rays, *rays, weights, added, device=counts.device)
+        _IN_GRID[added.dtype](n_items, n_rays, *rays, weights, added)
         if many:
             counts += added
         return
     one = torch.ones((), dtype=torch.float64, device=counts.device)
-    for visit in traverse(starts, ends, shape, chunk_visits, low=low):
-        source = one.expand(visit.voxel.shape) if weights is None else weights[visit.ray]
-        counts.scatter_add_(0, visit.voxel, source)
+    for voxel, ray in traverse(starts, ends, shape, low=low):
+        counts.scatter_add_(0, voxel, one.expand(voxel.shape) if weights is None else weights[ray])
 
 
 class BlockTable(NamedTuple):
@@ -356,13 +324,7 @@ class BlockTable(NamedTuple):
 
 
 def count_in_blocks(
-    counts: Callable[[], Tensor],
-    table: BlockTable,
-    starts: Tensor,
-    ends: Tensor,
-    weights: Tensor | None,
-    *,
-    chunk_visits: int = CHUNK_VISITS,
+    counts: Callable[[], Tensor], table: BlockTable, starts: Tensor, ends: Tensor, weights: Tensor | None
 ) -> None:
     """Add the weight of each ray at every voxel that it leaves; stores the blocks of these voxels.
 
@@ -371,10 +333,9 @@ def count_in_blocks(
         table: contains the starts and the ends.
         starts, ends: (R, D) in voxels.
         weights: (R,); ones if not given.
-        chunk_visits: of the twin, see `traverse`.
     """
     starts, ends = starts.double(), ends.double()
-    weights = None if weights is None else weights.to(counts().dtype).contiguous()
+    weights = None if weights is None else weights.to(counts().dtype)
     low = table.low * (1 << table.local_bits)
     if is_fused(counts(), starts, ends, weights):
         _count_in_blocks_fused(counts, table, starts, ends, weights, low)
@@ -382,13 +343,13 @@ def count_in_blocks(
     bits = tuple(b + table.local_bits for b in table.bits)
     one = torch.ones((), dtype=counts().dtype, device=starts.device)
     shape, strides = tuple(1 << b for b in bits), packed_strides(bits)
-    for visit in traverse(starts, ends, shape, chunk_visits, strides, low):
-        block, place = _split(visit.voxel, table.bits, table.local_bits)
+    for voxel, ray in traverse(starts, ends, shape, strides=strides, low=low):
+        block, place = _split(voxel, table.bits, table.local_bits)
         first = table.first.index_select(0, block)
         if int(first.min()) < 0:
             table.open(block[first < 0].long().unique())
             first = table.first.index_select(0, block)
-        source = one.expand(first.shape) if weights is None else weights[visit.ray]
+        source = one.expand(first.shape) if weights is None else weights[ray]
         counts().scatter_add_(0, first.add_(place), source)
 
 
@@ -408,7 +369,7 @@ def _count_in_blocks_fused(
     shape = tuple(1 << b for b in table.bits)
     strides = packed_strides(table.bits)
     rays = rays_argument(starts / side, ends / side, shape, strides, table.low, unit=1 / side)
-    _MARK(n_rays, *rays, marked, device=device)
+    _MARK(n_rays, *rays, marked)
     new = (marked & (table.first < 0)).nonzero().squeeze(1)
     if new.numel():
         table.open(new)
@@ -420,7 +381,7 @@ def _count_in_blocks_fused(
     fields = [table.local_bits, shifts[0], shifts[1], (1 << bits[1]) - 1, mask2, above[0], above[1]]
     kernel = _IN_BLOCKS[counts().dtype]
     n_items = _n_items(n_rays, device)
-    kernel(n_items, n_rays, *rays, table.first, *fields, weights, counts(), device=device)
+    kernel(n_items, n_rays, *rays, table.first, *fields, weights, counts())
 
 
 def mark_cells_of_rays(
@@ -437,11 +398,11 @@ def mark_cells_of_rays(
     strides = row_major_strides(shape)
     if is_fused(marks, starts, stops, is_hit, low):
         rays = rays_argument(starts, stops, shape, strides, low)
-        _MARK_BITS(len(stops), *rays, is_hit.contiguous(), bit, marks, device=marks.device)
+        _MARK_BITS(len(stops), *rays, is_hit, bit, marks)
         return
     flat = marks.view(-1)
-    for visit in traverse(starts, stops, shape, low=low):
-        flat[visit.voxel] |= bit
+    for voxel, _ in traverse(starts, stops, shape, low=low):
+        flat[voxel] |= bit
     ends = stops[is_hit].floor().long() - low
     inside = ((ends >= 0) & (ends < torch.tensor(shape, device=ends.device))).all(1)
     flat[(ends[inside] * torch.tensor(strides, device=ends.device)).sum(1)] |= bit
@@ -453,20 +414,14 @@ def _n_items(n_rays: int, device: torch.device) -> int:
 
 
 def _split(voxel: Tensor, block_bits: tuple[int, ...], local_bits: int) -> tuple[Tensor, Tensor]:
-    """Block in the table, and place in the block, (V,) each, of packed cell indices (V,).
-
-    The field of each axis is cut into block bits and local bits; each kind is packed again.
-    """
+    """Block in the table, and place in the block, (V,) each, of packed cell indices (V,)."""
     bits = tuple(b + local_bits for b in block_bits)
     packed = voxel.int() if sum(bits) < 31 else voxel
-    side_mask = (1 << local_bits) - 1
-    block, place = packed >> local_bits & ((1 << block_bits[-1]) - 1), packed & side_mask
-    for axis in range(len(bits) - 2, -1, -1):
-        shift, width = _fields(bits)[axis][0], block_bits[axis]
-        above = sum(block_bits[axis + 1 :])
-        block = block | ((packed >> (shift + local_bits - above)) & (((1 << width) - 1) << above))
-        low = local_bits * (len(bits) - 1 - axis)
-        place = place | ((packed >> (shift - low)) & (side_mask << low))
+    block, place = torch.zeros_like(packed), torch.zeros_like(packed)
+    for shift, width in _fields(bits):
+        cell = packed >> shift & ((1 << width) - 1)
+        block = block << (width - local_bits) | cell >> local_bits
+        place = place << local_bits | cell & ((1 << local_bits) - 1)
     return block, place
 
 

@@ -117,15 +117,12 @@ def first_hits(tree: TriangleTree, origins: Tensor, directions: Tensor) -> Tenso
     Args:
         origins: (N, 3), or (3,) if all rays start at one point. directions: (N, 3).
     """
-    directions = directions.contiguous()
     if is_fused(tree.boxes, origins, directions):
         n, device = len(directions), directions.device
         found = torch.empty(n, dtype=torch.float64, device=device)
         n_items = -(-n // CPU_LANES) if device.type == "cpu" else n
         stride = 3 if origins.ndim == 2 else 0
-        _HITS(
-            n_items, n, origins.contiguous(), stride, directions, *tree, len(tree.boxes), found, device=device
-        )
+        _HITS(n_items, n, origins, stride, directions, *tree, len(tree.boxes), found)
         return found
     origins = origins.expand(directions.shape)
 
@@ -149,10 +146,9 @@ def first_hits(tree: TriangleTree, origins: Tensor, directions: Tensor) -> Tenso
 
 def nearest_triangles(tree: TriangleTree, points: Tensor) -> Tensor:
     """Distances (N,) from points (N, 3), finite, to the nearest triangle."""
-    points = points.contiguous()
     if is_fused(tree.boxes, points):
         found = torch.empty_like(points[:, 0])
-        _NEAREST(len(points), points, *tree, len(tree.boxes), found, device=points.device)
+        _NEAREST(len(points), points, *tree, len(tree.boxes), found)
         return found
 
     def compute(part: slice) -> Tensor:

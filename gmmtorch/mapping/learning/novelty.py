@@ -73,7 +73,7 @@ def _add_beams(
             f"resolution={rule.resolution} m is too fine for beams that span {shape} cells; take more."
         )
     strides = torch.tensor([math.prod(shape[axis + 1 :]) for axis in range(len(shape))], device=low.device)
-    passed = [(visit.voxel, visit.ray) for visit in traverse(starts, stops, shape, low=low)]
+    passed = list(traverse(starts, stops, shape, low=low))
     hit = is_hit.nonzero().squeeze(1)
     last = ((cells[hit] - low).long() * strides).sum(1)
     voxel = torch.cat([*(v for v, _ in passed), last])

@@ -21,7 +21,6 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import (
-    TruncatedLimits,
     chunk_elements,
     chunked,
     fused_truncated_em,
@@ -179,7 +178,7 @@ def _run_fused(
     rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings, candidates: Tensor | None
 ) -> tuple[EMResult[Parameters], Tensor, Tensor]:
     """`run_truncated` by the fused kernel."""
-    limits = TruncatedLimits(settings.reg_covar, settings.tol, settings.previous_bound, settings.max_iter)
+    limits = settings.reg_covar, settings.tol, settings.previous_bound, settings.max_iter
     found = fused_truncated_em(
         *(rows.values, rows.weight, owner, parameters, limits),
         settings.n_candidates if candidates is None else candidates,

@@ -81,19 +81,15 @@ def cone_evidence(
         if planes is None:
             inside = ((bottom < 0) & (top > 0)).all(0)
             mean = part.apply(part.mean - part.origin)
-            beyond = share_beyond_2d(_corners_2d(part, bottom, top), mean, inside, cutoff)
+            (x1, y1), (x2, y2) = bottom, top
+            around = ((x1, y1), (x2, y1), (x2, y2), (x1, y2))
+            corners = torch.stack([part.apply(torch.stack(corner)) for corner in around])
+            beyond = share_beyond_2d(corners, mean, inside, cutoff)
         else:
             beyond = share_beyond_3d(planes.take(cone), bottom, top, exact, cutoff)
         misses = misses.index_add(0, box, (beyond - mass).clamp_min(0) * counts[cone])
         hits = hits.index_add(0, box, torch.where(cones.max_range[cone], 0.0, mass * counts[cone]))
     return hits, misses
-
-
-def _corners_2d(white: WhitenedCones, low: Tensor, high: Tensor) -> Tensor:
-    """Whitened corners (4, 2, P) of cells [low, high], (2, P) each, in cyclic order."""
-    (x1, y1), (x2, y2) = low, high
-    corners = ((x1, y1), (x2, y1), (x2, y2), (x1, y2))
-    return torch.stack([white.apply(torch.stack(corner)) for corner in corners])
 
 
 def _reached(white: WhitenedCones, low: Tensor, high: Tensor, cutoff: float) -> Tensor:
@@ -338,16 +334,6 @@ _FAR = 9.0  # |x| beyond which e^(−x²/2) is negligible
 _ROOT_TWO_PI = math.sqrt(2 * math.pi)
 
 
-@functools.cache
-def _gauss_legendre(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Nodes and weights (n,) on [0, 1]."""
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return (
-        torch.as_tensor((nodes + 1) / 2, dtype=dtype, device=device),
-        torch.as_tensor(weights / 2, dtype=dtype, device=device),
-    )
-
-
 def owens_t(h: Tensor, a: Tensor) -> Tensor:
     """T(h, a) = 1/2π ∫_0^a exp(−½h²(1 + x²))/(1 + x²) dx, exact to 1e-14 (Owen 1956); h and a broadcast.
 
@@ -369,11 +355,11 @@ def owens_t(h: Tensor, a: Tensor) -> Tensor:
 
 def _shallow(h: Tensor, a: Tensor) -> Tensor:
     """T(h, a) for |a| ≤ 1, h ≥ 0."""
-    nodes, weights = _gauss_legendre(a.dtype, a.device)
+    nodes, weights = ((x / 2).tolist() for x in np.polynomial.legendre.leggauss(_NODES))
     half = -0.5 * h.clamp_max(_FLAT) ** 2
     total = torch.zeros_like(a)
     for node, weight in zip(nodes, weights, strict=True):  # vectorised it would take n times the memory
-        stretched = 1 + (node * a) ** 2
+        stretched = 1 + ((node + 0.5) * a) ** 2  # the nodes are those of [−½, ½]
         total = total + weight * torch.exp(half * stretched) / stretched
     return total * a / (2 * math.pi)
 

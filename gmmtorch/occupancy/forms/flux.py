@@ -121,7 +121,7 @@ class FacePatches(Patches):
         # e^{−½|d − a w/|w||²} ∫_a^∞ (x + b)^{D−1} e^{−x²/2} dx / |w|^D, see `tail_moment` of
         # kernels/evidence/point_evidence.py. The vectors are affine in f, so each of their products is a
         # polynomial in f.
-        monomials, mean = rule.monomials(), self.ray - self.offset
+        (monomials, weights), mean = rule, self.ray - self.offset
         # d × w = d₀ × w₀ + Σ f_i edge_i × m, since w − d = m is the same everywhere.
         square = square_on(monomials, self.ray, self.edges).clamp_min(1e-30)
         turned = square_on(monomials, cross(self.offset, self.ray), cross(self.edges, mean[None]))
@@ -142,7 +142,7 @@ class FacePatches(Patches):
                 density = nearest * density + edge * inverse + tail / square
             seen = (across < self.cutoff**2) & (along < self.cutoff)
         density = torch.exp(-0.5 * across) * inverse * density.clamp_min(0)
-        return self.strength * (rule.weights @ torch.where(seen, density, 0.0))
+        return self.strength * (weights @ torch.where(seen, density, 0.0))
 
 
 def flux_evidence(
@@ -191,8 +191,8 @@ def flux_evidence(
     for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
         misses = _add_faces(misses, white, counts, grid, axis, rows, how)
     hits = torch.zeros_like(misses)
-    for row, cell in cells_in_chunks(balls.first, balls.number, CHUNK_FACES):
-        cone, low = balls.cone[row], _world(grid, cell.double())
+    for row, cell in cells_in_chunks(*balls[1:], CHUNK_FACES):
+        cone, low = balls[0][row], _world(grid, cell.double())
         mass = box_mass(white.take(cone), low, low + grid.resolution, *how)
         hits = hits.index_add(0, row_major(cell.unbind(), grid.shape), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
@@ -321,11 +321,7 @@ def checked_boxes(low: ArrayLike, high: ArrayLike, cones: Cones) -> tuple[Tensor
 
 
 def _box_face_flux(
-    white: WhitenedCones,
-    corners: tuple[Tensor, Tensor],
-    axis: int,
-    forward: bool,
-    how: Rules,
+    white: WhitenedCones, corners: tuple[Tensor, Tensor], axis: int, forward: bool, how: Rules
 ) -> Tensor:
     """Flux (P,) out of one face of each box; 0 where the sensor origin is on the outer side of the face."""
     low, high = corners
@@ -340,12 +336,7 @@ def _box_face_flux(
 
 
 def _face_flux(
-    white: WhitenedCones,
-    center: Tensor,
-    side: Tensor,
-    axis: int,
-    forward: Tensor | bool,
-    how: Rules,
+    white: WhitenedCones, center: Tensor, side: Tensor, axis: int, forward: Tensor | bool, how: Rules
 ) -> Tensor:
     """Flux (P,) through faces across `axis`, along or against it, with centres and sides (D, P), metres."""
     others = [b for b in range(len(center)) if b != axis]
@@ -466,11 +457,7 @@ def region_flux(
 
 
 def _face_integrals(
-    white: WhitenedCones,
-    boundary: Boundary,
-    face: Tensor,
-    cone: Tensor,
-    how: Rules,
+    white: WhitenedCones, boundary: Boundary, face: Tensor, cone: Tensor, how: Rules
 ) -> tuple[Tensor, Tensor]:
     """Flux out of each face (P,), and the signed mass above it (P,)."""
     cutoff, tolerance, dtype = how

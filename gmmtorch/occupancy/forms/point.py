@@ -17,14 +17,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.kernels import (
-    Lists,
-    PointTable,
-    chunked,
-    is_fused,
-    listed_evidence,
-    pair_evidence,
-)
+from gmmtorch.kernels import Lists, PointTable, chunked, is_fused, listed_evidence, pair_evidence
 from gmmtorch.linalg import order_along_curve, safe_cholesky
 from gmmtorch.occupancy.cone_index import ConeIndex, Hulls, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
@@ -85,10 +78,7 @@ class PointEvidence(NamedTuple):
 
 
 def point_evidence(
-    cones: Cones,
-    points: ArrayLike,
-    resolution: float,
-    cutoff: float = CUTOFF,
+    cones: Cones, points: ArrayLike, resolution: float, cutoff: float = CUTOFF
 ) -> PointEvidence:
     """Evidence of the cube of side `resolution` (m) centred at each point (M, D), world metres.
 

@@ -43,17 +43,9 @@ _MAX_SPLIT = 4  # parts per cut and axis: panels outside the component are dropp
 _SMALLEST = 1e-15  # smallest panel relative to its patch: ends the cutting close to the sensor origin
 
 
-class Rule(NamedTuple):
-    """Nodes (n, D−1) and weights (n,) of a quadrature on the reference patch."""
-
-    nodes: Tensor
-    weights: Tensor
-
-    def monomials(self) -> Tensor:
-        """1, f_i, f_i f_j (i ≤ j) at the nodes: (n, 3) in 2D, (n, 6) in 3D."""
-        f = self.nodes.T
-        pairs = itertools.combinations_with_replacement(range(len(f)), 2)
-        return torch.stack([torch.ones_like(f[0]), *f, *(f[i] * f[j] for i, j in pairs)], 1)
+Rule = tuple[Tensor, Tensor]
+"""A quadrature on the reference patch: 1, f_i, f_i f_j (i ≤ j) at its nodes f, (n, 3) in 2D and (n, 6) in 3D;
+and the weights (n,) of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +202,10 @@ def _rule(orders: tuple[int, ...], triangular: bool, dtype: torch.dtype, device:
     if triangular:  # maps the square to the triangle: (x, y) ↦ (x(1 − y), y)
         x, y = (nodes + 0.5).T
         nodes, weights = np.stack([x * (1 - y), y], 1), weights * (1 - y)
-    return Rule(*(torch.as_tensor(part, dtype=dtype, device=device) for part in (nodes, weights)))
+    f = torch.as_tensor(nodes.T, dtype=dtype, device=device)
+    pairs = itertools.combinations_with_replacement(range(len(f)), 2)
+    monomials = torch.stack([torch.ones_like(f[0]), *f, *(f[i] * f[j] for i, j in pairs)], 1)
+    return monomials, torch.as_tensor(weights, dtype=dtype, device=device)
 
 
 def _cut_boxes(panels: _Panels, ratio: Tensor) -> _Panels:
@@ -323,14 +318,14 @@ class MassPatches(Patches):
         return (turned * turned + rise * rise).sqrt()
 
     def sums(self, rule: Rule, simple: bool) -> Tensor:
-        monomials = rule.monomials()
+        monomials, weights = rule
         spread = cross(self.edges, self.direction[None])
         across = square_on(monomials, cross(self.offset, self.direction), spread).clamp_min(0)
         along = linear_on(monomials, self.offset, self.edges, self.direction)
         beyond = torch.maximum(along, -(along + self.span)).clamp_min(0)
         reached = across + beyond * beyond < self.cutoff**2
         density = torch.exp(-0.5 * across) * normal_mass(along, self.span.expand_as(along))
-        share = rule.weights @ torch.where(reached, density, 0.0)
+        share = weights @ torch.where(reached, density, 0.0)
         return self.area * share / (2 * math.pi) ** (0.5 * (len(self.offset) - 1))
 
 

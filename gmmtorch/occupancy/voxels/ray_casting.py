@@ -14,8 +14,6 @@ from gmmtorch.kernels import count_in_grid
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, flat_index, intersection, to_lattice
 
-_CHUNK_VISITS = 1 << 16  # fastest when cores share a cache
-
 
 def cast_evidence(
     origins: ArrayLike,
@@ -93,15 +91,7 @@ class RaysInBox(NamedTuple):
         """The sum (cells,) float64 of the weights (R,) of the rays that leave each cell of the block."""
         counts = torch.zeros(math.prod(self.block.shape), dtype=torch.float64, device=weights.device)
         weights = weights if self.ray is None else weights.index_select(0, self.ray)
-        count_in_grid(
-            counts,
-            self.starts,
-            self.stops,
-            self.block.shape,
-            weights,
-            low=self.low,
-            chunk_visits=_CHUNK_VISITS,
-        )
+        count_in_grid(counts, self.starts, self.stops, self.block.shape, weights, self.low)
         return counts
 
 

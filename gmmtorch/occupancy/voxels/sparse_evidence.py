@@ -1,16 +1,16 @@
-"""SparseEvidence: hits and misses in blocks of cells, stored only where there is evidence."""
+"""Sparse stores: the key index that they share, and hits and misses in blocks of cells with evidence."""
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
-from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.errors import InvalidArgumentError, MemoryLimitError, check_resolution
 from gmmtorch.kernels import (
-    CHUNK_VISITS,
     BlockKeys,
     BlockTable,
     add_counts,
@@ -22,12 +22,121 @@ from gmmtorch.kernels import (
 from gmmtorch.occupancy.evidence import checked_rays, occupancy_probability
 from gmmtorch.occupancy.grid import BYTES_PER_CELL, MEMORY_LIMIT
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, contains, intersection
-from gmmtorch.occupancy.voxels.sparse_lattice import SparseLattice
+
+_NOWHERE = 2.0**62  # a coordinate beyond all keys
+_LOCAL_BITS = {2: 4, 3: 3}  # bits of the position of a cell in its block, along each axis
 
 
-def count_misses(
-    store: SparseEvidence, origins: Tensor, ends: Tensor, weights: Tensor | None, chunk_visits: int
-) -> None:
+class SparseLattice:
+    """Base of the sparse stores: an unbounded lattice of cells, of which some are stored, under sorted keys.
+
+    Cell i is the square or cube [i, i + 1) times the resolution, world frame. A block has 16² cells in 2D
+    and 8³ cells in 3D. A key packs the coordinates of a block relative to `anchor`, so that maps far from
+    the world's origin work, too. Stored keys are found by binary search.
+
+    Args:
+        resolution: side (m) of the cells.
+        dim: 2 or 3.
+        axis_bits: bits of one block coordinate in a key.
+        memory_limit: bytes that the store can take.
+    """
+
+    def __init__(
+        self,
+        resolution: float,
+        dim: int,
+        axis_bits: int,
+        device: torch.device | str | None,
+        memory_limit: int,
+    ) -> None:
+        self.resolution = check_resolution(resolution)
+        self.dim = dim
+        self.memory_limit = memory_limit
+        self.anchor: Tensor | None = None
+        """Block (D,), int64, on the CPU, that keys are relative to; None until something is stored."""
+        self.keys = torch.empty(0, dtype=torch.int64, device=device)
+        """Stored keys (N,), ascending."""
+        self._axis_bits = axis_bits
+        self._half = 1 << (axis_bits - 1)
+        self.local_bits = _LOCAL_BITS[dim]
+
+    @property
+    def block_side(self) -> int:
+        """Cells of a block along one axis."""
+        return 1 << self.local_bits
+
+    @property
+    def cells_per_block(self) -> int:
+        return 1 << (self.local_bits * self.dim)
+
+    @property
+    def device(self) -> torch.device:
+        return self.keys.device
+
+    def cells_of(self, points: Tensor) -> Tensor:
+        """Cell (M, D), float64, of each point (M, D), world metres."""
+        return (points.double() / self.resolution).floor()
+
+    def origin(self) -> Tensor:
+        """The anchor, or zero if it is not set: (D,) int64."""
+        return torch.zeros(self.dim, dtype=torch.int64) if self.anchor is None else self.anchor
+
+    def columns(self, cells: Tensor) -> list[Tensor]:
+        """Coordinates (M,) of cells (M, D) along each axis, relative to the lowest cell of the anchor."""
+        low = (self.origin() * self.block_side).tolist()
+        return [cells[:, axis] - low[axis] for axis in range(self.dim)]
+
+    def reachable(self, columns: list[Tensor]) -> Tensor:
+        """Whether each cell (M,), of `columns` of any dtype, has a key; False for NaN and infinity."""
+        limit = (self._half - 1) * self.block_side
+        return functools.reduce(torch.logical_and, [column.abs() < limit for column in columns])
+
+    def check_reachable(self, cells: Tensor) -> None:
+        """Raise `InvalidArgumentError` unless all cells (M, D) have keys. Sets a missing anchor."""
+        if cells.shape[0] and self.anchor is None:
+            self.anchor = (cells[0] / self.block_side).floor().long().cpu()
+        if not bool(self.reachable(self.columns(cells)).all()):
+            reach = (self._half - 1) * self.block_side * self.resolution
+            raise InvalidArgumentError(
+                f"resolution={self.resolution} m cannot index points more than {reach:.3g} m from the first; "
+                "use a coarser one, or remove stray far points."
+            )
+
+    def block_keys(self, columns: list[Tensor]) -> Tensor:
+        """Keys (M,) of the blocks that contain the cells of `columns`, int64; ordered like block
+        coordinates.
+        """
+        key = (columns[0] >> self.local_bits) + self._half
+        for column in columns[1:]:
+            key = (key << self._axis_bits) | ((column >> self.local_bits) + self._half)
+        return key
+
+    def places(self, columns: list[Tensor]) -> Tensor:
+        """Row-major index (M,) of the cells of `columns` within their blocks."""
+        mask = self.block_side - 1
+        place = columns[0] & mask
+        for column in columns[1:]:
+            place = (place << self.local_bits) | (column & mask)
+        return place
+
+    def cells_at(self, keys: Tensor, places: Tensor) -> Tensor:
+        """Cells (M, D) in the blocks with these keys (M,), at these row-major indices (M,) within them."""
+        origin, columns = self.origin().tolist(), []
+        for axis, shift in enumerate(range(self.dim - 1, -1, -1)):
+            block = (keys >> (self._axis_bits * shift)) & ((1 << self._axis_bits) - 1)
+            place = (places >> (self.local_bits * shift)) & (self.block_side - 1)
+            columns.append(((block - self._half + origin[axis]) << self.local_bits) + place)
+        return torch.stack(columns, 1)
+
+    def find_keys(self, keys: Tensor) -> tuple[Tensor, Tensor]:
+        """Position (M,) of each key in `keys`, and whether it is stored (M,); any position if not."""
+        if self.keys.shape[0] == 0:
+            return torch.zeros_like(keys), torch.zeros_like(keys, dtype=torch.bool)
+        rank = torch.searchsorted(self.keys, keys).clamp_max(self.keys.shape[0] - 1)
+        return rank, self.keys[rank] == keys
+
+
+def count_misses(store: SparseEvidence, origins: Tensor, ends: Tensor, weights: Tensor | None) -> None:
     """Add one miss to each cell that a ray passes through and leaves, and store the blocks of all ends.
 
     Arguments as in `Evidence.add_rays`. Raises `MemoryLimitError` if the blocks that the rays touch exceed
@@ -48,7 +157,6 @@ def count_misses(
             origins.double() / store.resolution,
             ends.double() / store.resolution,
             weights,
-            chunk_visits=chunk_visits,
         )
     except MemoryLimitError:
         needed = _bytes_needed(store, origins, ends, store.resolution, earlier)
@@ -96,8 +204,8 @@ def _bytes_needed(
     low = blocks.amin(0)
     shape = tuple((blocks.amax(0) - low + 1).long().tolist())
     touched = torch.zeros(math.prod(shape), dtype=torch.bool, device=low.device)
-    for visit in traverse(starts, stops, shape, low=low):
-        touched[visit.voxel] = True
+    for voxel, _ in traverse(starts, stops, shape, low=low):
+        touched[voxel] = True
     # The traversal leaves out the blocks of the ends. Earlier blocks shrink at least in proportion.
     n_ends = torch.unique(stops.floor(), dim=0).shape[0]
     n_earlier = math.ceil(earlier * store.resolution / resolution)
@@ -195,7 +303,6 @@ class SparseEvidence(SparseLattice):
         ends: ArrayLike,
         weights: ArrayLike | None = None,
         is_hit: ArrayLike | None = None,
-        chunk_visits: int = CHUNK_VISITS,
     ) -> None:
         """Count rays: one hit in the cell of each end, one miss in every other cell that the ray passes.
 
@@ -209,7 +316,7 @@ class SparseEvidence(SparseLattice):
         origins, ends, weights, is_hit = checked_rays(origins, ends, weights, is_hit, self.dim, self.device)
         if ends.shape[0] == 0:
             return
-        count_misses(self, origins, ends, weights, chunk_visits)
+        count_misses(self, origins, ends, weights)
         columns = self.columns(self.cells_of(ends).long())
         index = self._first_of(self.block_keys(columns)) + self.places(columns)
         source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights
@@ -360,17 +467,13 @@ class SparseEvidence(SparseLattice):
 
         Points can be NaN or infinite: they have no evidence.
         """
-        return self.at_cells(self.cells_of(as_tensor(points, "points", device=self.device)))
+        cells = self.cells_of(as_tensor(points, "points", device=self.device))
+        reachable = self.reachable(self.columns(cells))
+        return self.at_cells(torch.where(reachable[:, None], cells, _NOWHERE).long())
 
     def at_cells(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Hits (C,) and misses (C,) of cells (C, D); 0 without evidence."""
-        columns = self.columns(cells)
-        reachable = self.reachable(columns)
-        columns = [torch.where(reachable, column, 0).long() for column in columns]
-        keys = torch.where(reachable, self.block_keys(columns), -1)
-        runs, run = torch.unique_consecutive(keys, return_inverse=True)
-        first = self._first_of(runs)[run]
-        index = torch.where(first > 0, first + self.places(columns), 0)
+        """Hits (C,) and misses (C,) of cells (C, D), int64; 0 without evidence."""
+        index = self._index_of(cells).clamp_min_(0)
         hits, misses = (counts.view(-1).index_select(0, index) for counts in self.counts)
         return hits, misses
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mixture.mixture_cases import cloud, random_parameters, random_weight, rows_of
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.kernels import TruncatedLimits, fused_exact_em, fused_truncated_em, kernels
+from gmmtorch.kernels import fused_exact_em, fused_truncated_em, kernels
 from gmmtorch.kernels.compiler import Team
 from gmmtorch.kernels.mixtures import em_loops
 from gmmtorch.mixture.em import loop
@@ -52,10 +52,11 @@ def test_a_run_of_exact_em_is_that_of_the_twin(device, seed, n, dim, k, tol, max
     with kernels("torch"):
         step = loop.em_step(Rows(features, weight, False), 1e-3, torch.float64)
         expected = loop.run_em(step, start, tol=tol, max_iter=max_iter)
-    found = fused_exact_em(features, weight, start, 1e-3, tol, max_iter, guarded=guarded, team=team)
-    assert not found.failed
-    assert found.bounds == pytest.approx(expected.lower_bounds, rel=1e-9, abs=1e-9)
-    for mine, other in zip(found.mixture, expected.parameters, strict=True):
+    limits = 1e-3, tol, max_iter
+    mixture, bounds, failed = fused_exact_em(features, weight, start, *limits, guarded=guarded, team=team)
+    assert not failed
+    assert bounds == pytest.approx(expected.lower_bounds, rel=1e-9, abs=1e-9)
+    for mine, other in zip(mixture, expected.parameters, strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-6, atol=1e-8)
 
 
@@ -66,10 +67,10 @@ def test_a_run_ends_before_what_it_cannot_compute(team):
     singular.covariances[1] = 1.0
     for some, first in ((points, singular), (points + 1e8, start._replace(means=start.means + 1e8))):
         limits = quadratic_features(some), weight, first, 1e-6, 0.0, 5
-        found = fused_exact_em(*limits, guarded=True, team=team)
-        assert found.failed
-        assert found.bounds == []
-        assert all(torch.equal(a, b) for a, b in zip(found.mixture, first, strict=True))
+        mixture, bounds, failed = fused_exact_em(*limits, guarded=True, team=team)
+        assert failed
+        assert bounds == []
+        assert all(torch.equal(a, b) for a, b in zip(mixture, first, strict=True))
 
 
 def test_a_start_whose_sums_lose_digits_takes_the_direct_step():
@@ -77,11 +78,10 @@ def test_a_start_whose_sums_lose_digits_takes_the_direct_step():
     wall[:, 0] *= 1e-10
     covariances = 1e6 * torch.eye(3).double().repeat(2, 1, 1)
     start = Parameters(torch.full((2,), 0.5).double(), wall[:2].clone(), covariances)
-    found = fused_exact_em(
-        quadratic_features(wall), torch.ones(300).double(), start, 1e-12, 0.0, 5, guarded=True
-    )
-    assert found.failed
-    assert len(found.bounds) < 5
+    weight = torch.ones(300).double()
+    _, bounds, failed = fused_exact_em(quadratic_features(wall), weight, start, 1e-12, 0.0, 5, guarded=True)
+    assert failed
+    assert len(bounds) < 5
 
 
 def test_callbacks_and_continued_runs_see_every_iteration():
@@ -101,7 +101,7 @@ def test_callbacks_and_continued_runs_see_every_iteration():
 
 
 def truncated_run(rows: Rows, owner, start, settings: Settings, team, candidates=None, **more):
-    limits = TruncatedLimits(settings.reg_covar, settings.tol, settings.previous_bound, settings.max_iter)
+    limits = settings.reg_covar, settings.tol, settings.previous_bound, settings.max_iter
     given = settings.n_candidates if candidates is None else candidates
     repaired = more.pop("repaired", lambda mixture: centered_parameters(Parameters(*mixture)))
     return fused_truncated_em(

@@ -201,7 +201,7 @@ def listed(features: torch.Tensor, natural: torch.Tensor, folder: Path) -> list[
     sizes = k, n_padded, n_blocks
     n_items = n_blocks * em_steps.squad_size(device)
     kernel = FusedKernel(str(source), "near_lists")
-    kernel(n_items, features, weight, n, natural, table, *sizes, upper, found, count, device=device)
+    kernel(n_items, features, weight, n, natural, table, *sizes, upper, found, count)
     return [row[:m] for row, m in zip(found.tolist(), count.tolist(), strict=True)]
 
 

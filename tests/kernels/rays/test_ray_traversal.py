@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -32,8 +33,8 @@ def visited(starts: Tensor, ends: Tensor, shape: tuple[int, ...], **options) -> 
     strides = options.get("strides") or row_major_strides(shape)
     found = []
     for chunk in traverse(starts, ends, shape, **options):
-        assert chunk.voxel.dtype == chunk.ray.dtype == torch.int64
-        for voxel, ray in zip(chunk.voxel.tolist(), chunk.ray.tolist(), strict=True):
+        assert {part.dtype for part in chunk} == {torch.int64}
+        for voxel, ray in zip(*(part.tolist() for part in chunk), strict=True):
             index = []
             for axis in sorted(range(len(shape)), key=lambda a: -strides[a]):
                 index.append((axis, voxel // strides[axis]))
@@ -63,11 +64,6 @@ def random_rays(
         return torch.round(unit * size / step) * step
 
     return draw(), draw()
-
-
-def one(start: list[float], end: list[float], shape: tuple[int, ...]) -> list[tuple[int, ...]]:
-    found = visited(torch.tensor([start]).double(), torch.tensor([end]).double(), shape)
-    return [voxel for _, voxel in found]
 
 
 # -- the oracle itself, by hand -----------------------------------------------------------------------
@@ -104,51 +100,22 @@ def test_the_unmasked_path_equals_the_masked_one(dim):
     assert visited(starts, ends, SHAPES[dim]) == with_outlier == expected(starts, ends, SHAPES[dim])
 
 
-@pytest.mark.parametrize("signs", [(1, 1, 1), (1, -1, 1), (-1, 1, -1), (-1, -1, -1)])
-@pytest.mark.parametrize("offset", [0.0, 0.25, 0.5])
-def test_diagonals_through_the_corners(signs, offset):
-    start = [offset if s > 0 else 5.0 - offset for s in signs]
-    end = [x + 4.75 * s for x, s in zip(start, signs, strict=True)]
-    rays = torch.tensor([start]).double(), torch.tensor([end]).double()
-    assert len(visited(*rays, (5, 5, 5))) >= 10
-    check(*rays, (5, 5, 5))
+SPANS = [(0.0, 4.0), (4.0, 0.0), (-3.5, 8.5), (8.0, -3.0), (1.25, 1.75), (3.0, 3.0), (0.5, 2.0), (3.5, 2.0)]
+BESIDE = [[[-2.0, -1, 1], [-1, 7, 1]], [[6, 0.5, 1], [9, 4.5, 1]], [[-1, 4.5, 1], [4.5, 10, 1]]]
+"""Rays that no cell of a grid of 5³ contains a part of."""
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("other", [0.0, 0.5, 2.0, 4.0, 5.0, -0.25])
-@pytest.mark.parametrize("span", [(0.0, 4.0), (4.0, 0.0), (-3.5, 8.5), (8.0, -3.0), (1.25, 1.75), (3.0, 3.0)])
-def test_rays_along_an_axis(axis, other, span):
-    start, end = [other] * 3, [other] * 3
-    start[axis], end[axis] = span
-    check(torch.tensor([start]).double(), torch.tensor([end]).double(), (5, 5, 5))
-
-
-def test_the_end_voxel_is_not_visited():
-    assert one([0.5, 0.5], [3.5, 0.5], (5, 5)) == [(0, 0), (1, 0), (2, 0)]
-    assert one([3.5, 0.5], [0.5, 0.5], (5, 5)) == [(1, 0), (2, 0), (3, 0)]
-
-
-def test_a_ray_that_ends_on_a_plane_has_crossed_it_only_upwards():
-    assert one([0.5, 0.5], [2.0, 0.5], (5, 5)) == [(0, 0), (1, 0)]  # 2.0 belongs to voxel 2
-    assert one([3.5, 0.5], [2.0, 0.5], (5, 5)) == [(3, 0)]
-
-
-@pytest.mark.parametrize("point", [[0.5, 0.5], [2.0, 3.0], [-1.0, 2.0]])
-def test_a_ray_of_no_length_leaves_nothing(point):
-    assert one(point, point, (5, 5)) == []
-
-
-@pytest.mark.parametrize(
-    ("start", "end"),
-    [
-        ([-2.0, -1.0], [-1.0, 7.0]),
-        ([6.0, 0.5], [9.0, 4.5]),
-        ([-1.0, 4.5], [4.5, 10.0]),
-        ([-3.0, 5.0], [9.0, 5.0]),
-    ],
-)
-def test_rays_outside_the_grid_visit_nothing(start, end):
-    assert one(start, end, (5, 5)) == []
+def test_rays_along_axes_and_diagonals_and_beside_the_grid_equal_the_reference_walk():
+    """Some of no length, and some that end on planes or lie in them."""
+    rays = [torch.tensor(pair).double() for pair in BESIDE]
+    for axis, other, span in itertools.product(range(3), (0.0, 0.5, 2.0, 4.0, 5.0, -0.25), SPANS):
+        rays.append(torch.full((2, 3), other).double())
+        rays[-1][:, axis] = torch.tensor(span)
+    for signs, offset in itertools.product(itertools.product((1, -1), repeat=3), (0.0, 0.25, 0.5)):
+        step = torch.tensor(signs).double()
+        start = torch.where(step > 0, offset, 5 - offset).double()
+        rays.append(torch.stack([start, start + 4.75 * step]))
+    check(*torch.stack(rays).unbind(1), (5, 5, 5))
 
 
 def test_no_rays_visit_nothing():
@@ -208,7 +175,7 @@ def test_visits_do_not_depend_on_the_chunk_size(chunk, margin):
 
 def test_chunks_have_about_the_requested_size():
     starts, ends = random_rays(5000, (50, 50), 0.0, 2.0**-10)
-    sizes = [chunk.voxel.numel() for chunk in traverse(starts, ends, (50, 50), chunk_visits=1000)]
+    sizes = [voxel.numel() for voxel, _ in traverse(starts, ends, (50, 50), chunk_visits=1000)]
     assert len(sizes) > 50
     assert max(sizes) <= 1000 + 100  # one ray more, at most
 
@@ -245,7 +212,7 @@ def test_a_ray_of_500_km_costs_no_more_than_the_grid(direction):
     offset = torch.tensor([direction]).double() * length
     starts, ends = middle - offset, middle + offset
     with LargestTensor() as work:
-        n = sum(chunk.voxel.numel() for chunk in traverse(starts, ends, shape))
+        n = sum(voxel.numel() for voxel, _ in traverse(starts, ends, shape))
     assert 0 < n <= sum(shape)
     assert work.largest < 4 * sum(shape)
 

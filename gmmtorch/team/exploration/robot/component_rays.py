@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels import THINNING, Seen, cast_components, hidden_area, is_fused, truncated_normals
+from gmmtorch.kernels import THINNING, cast_components, hidden_area, is_fused, truncated_normals
 from gmmtorch.linalg import safe_cholesky
 from gmmtorch.mapping import Components
 from gmmtorch.occupancy import (
@@ -191,7 +191,7 @@ def _fused(components: Components, seen: Tensor, box: Box, rule: RayRule) -> Cel
         components.origins.double(),
         components.max_range,
         components.ids,
-        Seen(components.seen_by[seen], components.seen_from[seen], count),
+        (components.seen_by[seen], components.seen_from[seen], count),
         torch.stack([*box, *window]).double(),
         resolution=rule.resolution,
         rays_per_cell=(rule.rays_per_cell, of_empty.rays_per_cell),

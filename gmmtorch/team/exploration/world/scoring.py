@@ -92,10 +92,10 @@ class BeliefMap:
         before = self.grid.add(evidence)
         chosen = flags_of_cells(evidence.cells, self._low, self._observable)
         added = evidence.hits, evidence.misses
-        removed = entropy_removed(before, added, chosen, self.rule.prior, self.rule.clamp)
-        self.known_bits += removed.bits
-        self.entropy_bits -= removed.chosen_bits
-        self.n_observed += removed.n_new
+        bits, observable, n_new = entropy_removed(before, added, chosen, self.rule.prior, self.rule.clamp)
+        self.known_bits += bits
+        self.entropy_bits -= observable
+        self.n_observed += n_new
 
     def probability(self, cells: Tensor) -> Tensor:
         """Occupancy (C,) of cells (C, 3), on the device of the cells."""
