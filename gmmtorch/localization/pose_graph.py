@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.pose import Pose
+from gmmtorch.pose import Pose, skew
 
 _SETTLED = 1e-7  # metres and radians: a smaller step ends the optimisation
 _MOST_STEPS = 100
@@ -128,12 +128,17 @@ def _weights(poses: Pose, edges: Edges, scale: float) -> Tensor:
 def _normal_equations(poses: Pose, edges: Edges, weights: Tensor) -> tuple[csc_matrix, np.ndarray]:
     """The Gauss–Newton Hessian and the gradient for steps of all poses but the first one, in their frames.
 
-    With T_i ← T_i Exp(x_i): ∂e/∂x_j ≈ I and ∂e/∂x_i ≈ −Ad(T_j⁻¹ T_i), which is exact where e = 0.
+    With T_i ← T_i Exp(x_i) and the error's rotation R and turn φ: ∂e/∂x_j = diag(R, J_r(φ)⁻¹) and
+    ∂e/∂x_i = −∂e/∂x_j Ad(T_j⁻¹ T_i).
     """
     n, free = len(poses), edges.information.shape[1]
-    error = residuals(poses, edges)
-    before = -(poses[edges.target].inverse() @ poses[edges.source]).adjoint()
-    after = torch.eye(free).to(before).expand_as(before)
+    between = poses[edges.source].inverse() @ poses[edges.target]
+    off = edges.motions.inverse() @ between
+    error = off.log()
+    after = torch.zeros(len(error), free, free).to(error)
+    after[:, : poses.dim, : poses.dim] = off.rotation
+    after[:, poses.dim :, poses.dim :] = _turn_jacobian(error[:, poses.dim :])
+    before = -after @ between.inverse().adjoint()
     information = weights[:, None, None] * edges.information
     rows, columns, values = [], [], []
     gradient = torch.zeros(n, free, dtype=torch.float64)
@@ -150,6 +155,17 @@ def _normal_equations(poses: Pose, edges: Edges, weights: Tensor) -> tuple[csc_m
     index = torch.cat(rows).numpy(), torch.cat(columns).numpy()
     hessian = coo_matrix((torch.cat(values).numpy(), index), shape=(n * free, n * free)).tocsc()
     return hessian[free:, free:], gradient.flatten()[free:].numpy()
+
+
+def _turn_jacobian(turn: Tensor) -> Tensor:
+    """J_r(φ)⁻¹ of turns φ (E, 1 or 3), rad: I + φ^/2 + (1 − α/2 · cot(α/2)) φ^²/α², with α = |φ| (Sola et al.
+    2018, equation 144)."""
+    eye = torch.eye(turn.shape[1]).to(turn)
+    if len(eye) == 1:
+        return eye.expand(len(turn), 1, 1)
+    half = turn.norm(dim=1).clamp_min(1e-4)[:, None, None] / 2
+    cross = skew(turn)
+    return eye + cross / 2 + (1 - half / half.tan()) / (4 * half.square()) * cross @ cross
 
 
 def _marginals(hessian: csc_matrix, n: int, free: int) -> Tensor:

@@ -16,7 +16,7 @@ from gmmtorch.localization import Odometry, loop_closure
 from gmmtorch.localization.local_map import nowhere
 from gmmtorch.localization.loop_closure import _Closure, _edges, _put_together
 from gmmtorch.localization.odometry import _ANYWHERE
-from gmmtorch.localization.pose_graph import Edges, _moved, optimised, residuals
+from gmmtorch.localization.pose_graph import Edges, _moved, _normal_equations, optimised, residuals
 from gmmtorch.pose import Pose
 
 FREE = {2: 3, 3: 6}
@@ -70,6 +70,41 @@ def test_the_optimum_is_that_of_a_dense_solver(dim):
     assert cost == pytest.approx(dense.cost, rel=1e-2)
     steps = torch.from_numpy(dense.x).view(len(start) - 1, -1)
     assert torch.allclose(found.poses[1:].matrix, _moved(start[1:], steps).matrix, atol=3e-3)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_steps_use_the_derivatives_of_the_errors(dim):
+    """Also far from the optimum, where guesses are turned by up to 3 rad."""
+    draw = torch.Generator().manual_seed(0)
+    n, free = 6, dim * (dim + 1) // 2
+    turns = torch.randn(n, free - dim, generator=draw).double()
+    turns *= 3 * torch.rand(n, 1, generator=draw).double() / turns.norm(dim=1, keepdim=True)
+    poses = Pose.from_turn(turns, torch.randn(n, dim, generator=draw).double() * 10)
+    edges = edges_of([(i, i + 1, Pose.identity(dim)) for i in range(n - 1)], 0.1)
+
+    def cost(steps: torch.Tensor) -> torch.Tensor:
+        moved = Pose.cat([poses[:1], _moved(poses[1:], steps)])
+        return residuals(moved, edges).square().sum() / 0.1**2 / 2
+
+    steps = torch.zeros(n - 1, free, dtype=torch.float64, requires_grad=True)
+    expected = torch.autograd.grad(cost(steps), steps)[0]
+    _, gradient = _normal_equations(poses, edges, torch.ones(n - 1).double())
+    torch.testing.assert_close(torch.from_numpy(gradient).view(n - 1, free), expected)
+
+
+def test_guesses_far_off_do_not_throw_the_poses_away():
+    """Half of a ring is turned and shifted by a wide edge, as where the sensor was lost."""
+    n = 40
+    yaw = torch.arange(n).double() * (2 * math.pi / n)
+    true = Pose.from_yaw(yaw, 5 * torch.stack([yaw.cos(), yaw.sin()], 1))
+    pairs = [*((i, i + 1) for i in range(n - 1)), (0, n - 1), (1, n - 2), (2, n - 3)]
+    edges = edges_of([(i, j, true[i].inverse() @ true[j]) for i, j in pairs], 0.01, 3)
+    edges.information[n // 2] = 1e-4 * torch.eye(3).double()
+    for turn in (-2.5, -1.0, 1.0, 3.0):
+        moved = Pose.from_yaw([turn], [80.0, -60.0]) @ true[n // 2 + 1 :]
+        found = optimised(Pose.cat([true[: n // 2 + 1], moved]), edges)
+        assert found.converged
+        torch.testing.assert_close(found.poses.matrix, true.matrix, atol=1e-5, rtol=0)
 
 
 def test_a_square_loop_spreads_its_error_evenly():
