@@ -19,7 +19,7 @@ from omegaconf import DictConfig
 import gmmtorch
 from gmmtorch.cli import common, options_help
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.cli import occupancy
+from gmmtorch.experiments.cli import occupancy_runs
 from gmmtorch.kernels import compiler
 from gmmtorch.team.cli import explore
 
@@ -45,7 +45,7 @@ def test_an_interrupt_that_python_drops_ends_the_command(monkeypatch, tmp_path):
             time.sleep(0.02)
             ended.append(step)
 
-    monkeypatch.setattr(occupancy, "_compare", work)
+    monkeypatch.setattr(occupancy_runs, "map_all", work)
     hook = sys.unraisablehook
     done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET)
     assert done.status == 130
@@ -65,7 +65,7 @@ def test_a_log_call_with_wrong_arguments_ends_no_command(monkeypatch, tmp_path):
         logger.warning("frame %s", "\x1b[31m")
         return [{}]
 
-    monkeypatch.setattr(occupancy, "_compare", work)
+    monkeypatch.setattr(occupancy_runs, "map_all", work)
     done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET)
     assert done.status == 0, done.stderr
     assert text.getvalue() == "frame \\x1b[31m\n"
@@ -223,7 +223,7 @@ def test_completion_offers_what_the_command_can_run(command, line, expected, run
 def test_a_sweep_prints_one_table_with_its_failed_jobs(monkeypatch, tmp_path):
     chosen = []
 
-    def work(config: DictConfig, _: str, folder: Path, __: object) -> list[dict[str, float]]:
+    def work(config: DictConfig, _: object, __: str, folder: Path, ___: object) -> list[dict[str, float]]:
         chosen.append(common.chosen_options(config))
         if config.seed == 2:
             raise InvalidArgumentError("seed=2 fails.")
@@ -234,7 +234,7 @@ def test_a_sweep_prints_one_table_with_its_failed_jobs(monkeypatch, tmp_path):
         common.print_table(rows, ["method"], "its own table")
         return rows
 
-    monkeypatch.setattr(occupancy, "_compare", work)
+    monkeypatch.setattr(occupancy_runs, "map_all", work)
     folder = tmp_path / "sweep"
     options = ["-m", "seed=1,2,3", "map.noise=0.01", f"hydra.sweep.dir={folder}"]
     done = run_here(monkeypatch, "occupancy", tmp_path / "run", *QUIET, *options)

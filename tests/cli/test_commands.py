@@ -190,6 +190,7 @@ def test_every_share_resolution_and_method_has_a_row_and_a_saved_map(run, tmp_pa
             "evaluation.kept=[1.0,0.5]",
             "evaluation.resolution=[0.2,0.1]",
             "evaluation.unknown=true",
+            "evaluation.removal=scans",
             "evaluation.pose_noise=[0.01,0.01]",
             f"evaluation.save_map={tmp_path / 'maps'}",
             f"evaluation.save_queries={tmp_path / 'queries.npz'}",
@@ -198,7 +199,7 @@ def test_every_share_resolution_and_method_has_a_row_and_a_saved_map(run, tmp_pa
     )
     rows = done.results()["rows"]
     assert len({(row["method"], row["kept"], row["resolution"]) for row in rows}) == len(rows) == 12
-    assert all("unknown_auc" in row and row["removal"] == "beams" for row in rows)
+    assert all("unknown_auc" in row and row["removal"] == "scans" for row in rows)
     assert (tmp_path / "queries.npz").is_file()
     for row in rows:
         path = tmp_path / "maps" / f"{row['method']}_{row['kept']:g}_{row['resolution']:g}.safetensors"

@@ -61,7 +61,7 @@ def test_a_smaller_share_of_beams_is_a_subset_of_a_larger_one():
     scans = room_scans(8)
     larger = beams(scans)
     for share in SHARES:
-        kept = beams(keep_share(scans, share, seed=3))
+        kept = beams(keep_share(scans, share, "beams", seed=3))
         assert len(kept) == len(scans)
         assert all(small <= large for small, large in zip(kept, larger, strict=True))
         larger = kept
@@ -70,12 +70,24 @@ def test_a_smaller_share_of_beams_is_a_subset_of_a_larger_one():
 @pytest.mark.parametrize("share", SHARES)
 def test_the_kept_share_of_beams_matches_the_option(share):
     scans = room_scans(10, n_beams=2000)
-    kept = keep_share(scans, share, seed=0)
+    kept = keep_share(scans, share, "beams", seed=0)
     tolerance = 5 * math.sqrt(share * (1 - share))
     for part in ("points", "no_return"):
         before = sum(len(getattr(scan, part)) for scan in scans)
         after = sum(len(getattr(scan, part)) for scan in kept)
         assert after / before == pytest.approx(share, abs=tolerance / math.sqrt(before))
+
+
+def test_a_smaller_share_of_scans_is_a_subset_in_the_same_order():
+    scans = room_scans(20)
+    larger = scans
+    for share in SHARES:
+        kept = keep_share(scans, share, "scans", seed=3)
+        assert len(kept) == max(1, math.ceil(share * len(scans)))
+        assert [id(scan) for scan in kept] == [
+            id(scan) for scan in larger if any(scan is other for other in kept)
+        ]
+        larger = kept
 
 
 # -- pose noise -----------------------------------------------------------------------------------
@@ -210,7 +222,8 @@ def test_random_choices_depend_only_on_the_seed():
     scans = room_scans(10)
     rays = query_points.test_beams(scans[:2], MANY, seed=0)
     for drawn in (
-        lambda seed: beams(keep_share(scans, 0.3, seed)),
+        lambda seed: beams(keep_share(scans, 0.3, "beams", seed)),
+        lambda seed: beams(keep_share(scans, 0.3, "scans", seed)),
         lambda seed: beams(perturb_poses(scans, (0.1, 0.1), seed)),
         lambda seed: hit_and_free(*rays, "uniform", 0.1, seed).points.tolist(),
     ):

@@ -29,7 +29,8 @@ from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact
 from gmmtorch.mapping.tiles.tile_files import tile_files
 from gmmtorch.mapping.tiles.tiled_map import TiledMap
-from gmmtorch.mixture import Cells, merge_components, quadratic_features
+from gmmtorch.mixture import Cells, merge_components
+from gmmtorch.mixture.em.exact import quadratic_features
 from gmmtorch.scan import Scan, display_colours, linear_colours
 
 

@@ -419,7 +419,8 @@ def maximized(moments: Parameters, reg_covar: float, previous: Parameters | None
         return Parameters(weights, means, covariances)
     if kind != "tied":
         keep = alive.view(-1, *[1] * (covariances.ndim - 1))
-        torch.where(keep, covariances, previous.covariances, out=covariances)
+        into = None if covariances.requires_grad else covariances
+        covariances = torch.where(keep, covariances, previous.covariances, out=into)
     means = torch.where(alive[:, None], means, previous.means)
     return Parameters(torch.where(alive, weights, 0.0), means, covariances)
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -35,8 +36,12 @@ _SPACING_NEIGHBORS = 32  # more than the beams of one ring that are nearer than 
 _SPACING_BEAMS = 1_000  # of a scan, for which the spacing is measured
 
 
-Deviations = tuple[Tensor, Tensor, Tensor]
-"""Standard deviations (m) of readings: along the beam, across it, and of its footprint."""
+class Deviations(NamedTuple):
+    """Standard deviations (m) of readings: along the beam, across it, and of its footprint."""
+
+    along: Tensor
+    across: Tensor
+    footprint: Tensor
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,7 @@ class DepthCameraModel(SensorModel):
         z = _ranges(distance)
         pixel = z * self.pixel_angle
         # The footprint is uniform within the pixel.
-        return a + b * z + c * z**2, pixel * self.lateral, pixel / math.sqrt(12)
+        return Deviations(a + b * z + c * z**2, pixel * self.lateral, pixel / math.sqrt(12))
 
     def _density(self, distance: Tensor) -> Tensor:
         return 1 / (distance * self.pixel_angle) ** 2
@@ -233,7 +238,7 @@ def measured_sensor(points: ArrayLike, origin: ArrayLike) -> LaserModel | LidarM
 def _laser(distance: ArrayLike, noise: float, proportional: float, divergence: float) -> Deviations:
     ranges = _ranges(distance)
     width = ranges * divergence / 4
-    return noise + proportional * ranges, width, width
+    return Deviations(noise + proportional * ranges, width, width)
 
 
 def _ranges(distance: ArrayLike) -> Tensor:
