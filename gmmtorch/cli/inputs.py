@@ -7,7 +7,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -32,7 +32,7 @@ from gmmtorch.scan import Scan
 _WITHOUT_POSES = ("scan_folder", "rosbag")  # data sets that `dataset.poses=standing` reads without poses
 
 
-OpenedDataset = tuple[Dataset, localization.Trajectory | None, Row | None]
+OpenedDataset: TypeAlias = "tuple[Dataset, localization.Trajectory | None, Row | None]"
 """A data set; with `dataset.odometry`, also its trajectory, and the facts of it for results.json."""
 
 

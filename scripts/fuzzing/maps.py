@@ -102,7 +102,7 @@ def maps(folder: Path, scans: list[Any]) -> dict[str, Target]:
             known, facts = read_index(place / index)
             row = [f"tile_{a}_{b}.safetensors" for a, b in known.tiles.tolist()].index(tile)
             known.n_bytes[row], known.crc32[row] = len(content), zlib.crc32(content)
-            (place / index).write_bytes(known.to_bytes(**facts))
+            (place / index).write_bytes(known.to_bytes(facts.pop("side"), coloured.settings, **facts))
         found = TiledMap(place)
         for row in found.near([-9, -9, -9], [9, 9, 9])[:3]:
             found.components(row)
