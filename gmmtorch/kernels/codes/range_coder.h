@@ -77,7 +77,7 @@ struct RangeCoder {
         }
     }
 
-    GMM_INLINE int64_t end() {
+    GMM_CALLED int64_t end() {
         if (WRITES) {
             uint64_t last = low;  // of the numbers that say the same, the one with most zeros at its end
             for (int n = 1; n < 32; ++n) {
@@ -109,7 +109,7 @@ struct RangeCoder {
     }
 
     // n bits without a model, highest first.
-    GMM_INLINE int64_t raw(int64_t n, int64_t value) {
+    GMM_CALLED int64_t raw(int64_t n, int64_t value) {
         int64_t found = 0;
         while (n > 0) {
             const int64_t width = minimum(n, (int64_t)8);
@@ -129,7 +129,7 @@ struct RangeCoder {
     }
 
     // n bits as a tree of 2^n slots, highest first.
-    GMM_INLINE int64_t tree(int64_t first, int64_t n, int64_t value) {
+    GMM_CALLED int64_t tree(int64_t first, int64_t n, int64_t value) {
         int64_t node = 1;
         for (int64_t i = n - 1; i >= 0; --i) node = node << 1 | bit(first + node, (value >> i) & 1);
         return node - (1 << n);
@@ -137,7 +137,7 @@ struct RangeCoder {
 
     // A number ≥ 0 below 2^60: the length of value + 1 in unary, then its other bits; the two highest of
     // these have slots.
-    GMM_INLINE int64_t number(int64_t first, int64_t value) {
+    GMM_CALLED int64_t number(int64_t first, int64_t value) {
         int64_t length = 0;
         const int64_t whole = value + 1;
         while (good && bit(first + 4 + minimum(length, (int64_t)11), (whole >> (length + 1)) != 0)) {
@@ -156,7 +156,7 @@ struct RangeCoder {
     }
 
     // Any whole number. side: 0, 1 or 2, the slot of its sign.
-    GMM_INLINE int64_t whole(int64_t first, int64_t value, int64_t side) {
+    GMM_CALLED int64_t whole(int64_t first, int64_t value, int64_t side) {
         if (!bit(first, value != 0)) return 0;
         const int64_t negative = bit(first + 1 + side, value < 0);
         const int64_t size = number(first, (value < 0 ? -value : value) - 1) + 1;
