@@ -44,6 +44,8 @@ def map_figure(
     truth: ArrayLike | None = None,
     lost: ArrayLike | None = None,
     title: str | None = None,
+    max_pixels: int = map_images.MAX_PIXELS,
+    max_queries: int = map_images.MAX_QUERIES,
 ) -> Figure:
     """Draws one panel per map: occupied dark, free light, unknown (θ within 0.02 of ½) blue-grey.
 
@@ -56,6 +58,8 @@ def map_figure(
         trajectories: sensor positions (S, D) of each drive in order, world metres.
         truth: true positions (S, D), drawn beside the trajectories.
         lost: positions (S, D) near which a scan was not localised.
+        max_pixels: pixels along each side of a picture; larger regions are sampled more coarsely.
+        max_queries: largest number of queries for one view from above.
     """
     dim = panels[0].dim
     paths = [style.as_array(path) for path in trajectories if len(path)]
@@ -71,7 +75,7 @@ def map_figure(
     else:
         height = 0.0 if dim == 2 else (panels[0].low[2] + panels[0].high[2]) / 2
     for axes, panel in zip(slices, panels, strict=False):
-        _draw_slice(axes, panel, paths, height, shown_pixels)
+        _draw_slice(axes, panel, paths, height, max_pixels, shown_pixels)
     greys = ScalarMappable(Normalize(0, 1), occupancy_colours())
     for band in bands:
         style.colour_bar(figure, greys, band[0].tolist(), "occupancy probability θ")
@@ -80,7 +84,7 @@ def map_figure(
         # One ceiling for all: panels that are cut at different heights cannot be compared.
         has_roof = flown is not None and any(map_images.roof_above(panel, flown) for panel in panels)
         top = height + map_images.HEADROOM if has_roof else math.inf
-        _draw_heights(figure, views, panels, paths, top, shown_pixels)
+        _draw_heights(figure, views, panels, paths, top, shown_pixels, max_queries)
     for axes in bands[-1][:, len(panels) - (n_bands - 1) * n_columns :].flat:
         axes.set_visible(False)
     for axes in np.concatenate([band[-1] for band in bands]):
@@ -95,11 +99,16 @@ def map_figure(
 
 
 def _draw_slice(
-    axes: Axes, panel: map_images.MapPanel, paths: list[np.ndarray], height: float, shown_pixels: int
+    axes: Axes,
+    panel: map_images.MapPanel,
+    paths: list[np.ndarray],
+    height: float,
+    max_pixels: int,
+    shown_pixels: int,
 ) -> None:
     """Draws θ of the cells in 2D, or of those at z = `height` (m) in 3D, and the sensor paths."""
     cells = f"cells of {style.metres(panel.resolution)}"
-    image = map_images.slice_image(panel, height, shown_pixels=shown_pixels)
+    image = map_images.slice_image(panel, height, max_pixels, shown_pixels)
     # Colours are resampled, not probabilities: the mean of free and occupied would look unknown.
     image.draw(axes, occupancy_colours()(np.ma.masked_invalid(image.image.numpy())), "antialiased")
     _draw_paths(axes, panel, paths)
@@ -114,10 +123,11 @@ def _draw_heights(
     paths: list[np.ndarray],
     top: float,
     shown_pixels: int,
+    max_queries: int,
 ) -> None:
     """Draws the views from above, of the cells below z = `top` (m), with a colour bar for each band."""
     cut = [_below(panel, top) for panel in panels]
-    images = [map_images.height_image(panel, shown_pixels) for panel in cut]
+    images = [map_images.height_image(panel, shown_pixels, max_queries) for panel in cut]
     known = torch.cat([image.image[image.image.isfinite()] for image in images])
     colours = matplotlib.colormaps[style.HEIGHTS].with_extremes(bad=_NONE)
     heights = ScalarMappable(style.height_scale(known), colours)

@@ -279,6 +279,13 @@ def test_component_count_study(run, monkeypatch):
     assert any("tfevents" in name for name in done.files())
 
 
+def test_forms_that_integrate_over_cells_are_drawn_in_3d(run):
+    options = ["dataset=synthetic_building", "dataset.n_scans=4", "evaluation.test_every=4"]
+    forms = ["method=[flux,cone,occupancy_grid]", "evaluation.resolution=[0.5]", "evaluation.max_beams=200"]
+    done = succeeded(run("occupancy", *options, *forms, "report.figures=true"))
+    assert "map_0.5m.png" in done.files()
+
+
 def test_the_number_of_components_can_be_automatic(run):
     done = succeeded(run("fit", "mixture.n_components=null", "mixture.noise=10"))
     assert done.results()["rows"][0]["n_components"] == 1
