@@ -51,6 +51,7 @@ from .reduction import merge as merge
 from .reduction import merge_components as merge_components
 from .reduction import merge_in_rounds as merge_in_rounds
 from .reduction import simplify as simplify
+from .streaming import SAMPLE_POINTS as SAMPLE_POINTS
 from .streaming import Checkpoint as Checkpoint
 from .streaming import fit_stream as fit_stream
 from .streaming import score_stream as score_stream

@@ -96,6 +96,7 @@ def fit_stream(
         if survey.n_points == 0:
             raise DataError(f"{source.name} has no valid points, only {survey.n_dropped} invalid ones.")
         mixture.check_parameters(survey.n_points)
+        # What checkpoints of version 1.0 say of EM's own E-step.
         name = f"ExactEStep(dtype={mixture.dtype!r})" if e_step is None else repr(e_step)
         facts = run_facts(mixture, survey, name)
         first = first_state(mixture, survey, facts, generator, checkpoint, processes)
@@ -111,10 +112,9 @@ def fit_stream(
             rows, owner = Rows(points, points.new_ones(len(points))), nearest(points, parameters.means)
             result = fit_truncated(rows, owner, parameters, mixture._settings(on_iteration, processes))
         else:
+            step = _stream_step(mixture, source, processes, center, e_step, survey.n_points)
             result = loop.run_em(
-                _noted(
-                    _stream_step(mixture, source, processes, center, e_step, survey.n_points), done, write
-                ),
+                _noted(step, done, write),
                 parameters,
                 tol=mixture.tol,
                 max_iter=mixture.max_iter,

@@ -82,7 +82,7 @@ def test_two_processes_give_the_result_of_one_and_write_it_once(run, cloud, tmp_
 
 
 def test_a_streamed_row_covers_the_whole_cloud(run, cloud, monkeypatch):
-    monkeypatch.setattr(fit_runs, "_SAMPLE_POINTS", 300)
+    monkeypatch.setattr(fit_runs, "SAMPLE_POINTS", 300)
     done = run(f"points={cloud}")
     assert done.status == 0, done.stderr
     (row,) = done.results()["rows"]

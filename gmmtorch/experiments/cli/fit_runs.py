@@ -16,16 +16,12 @@ from gmmtorch.datasets import PointChunks, in_memory, open_points
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments import evaluation
 from gmmtorch.experiments.evaluation import FitData, FitOptions, FitOutcome
-from gmmtorch.mixture import Checkpoint, PruneOptions, is_launched, joined
+from gmmtorch.mixture import SAMPLE_POINTS, Checkpoint, PruneOptions, is_launched, joined
 from gmmtorch.report import Event, ProgressBars, Row
 from gmmtorch.scan import Scan
 
 if TYPE_CHECKING:
     from gmmtorch.report import Board
-
-_TIMEOUT = 600.0  # seconds that the processes of torchrun wait for each other
-_CHECKPOINT_EVERY = 10  # iterations
-_SAMPLE_POINTS = 100_000  # size of the random sample for the initialization of EM and for PSNR2
 
 
 # -- points and options ----------------------------------------------------------------------------------
@@ -117,7 +113,7 @@ def stream(config: DictConfig, columns: Sequence[str], folder: Path) -> Row | No
         device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}"
     _check(config)
     with (
-        joined(device, _TIMEOUT) as processes,
+        joined(device) as processes,
         ProgressBars(enabled=config.report.progress and processes.rank == 0) as bars,
     ):
         row, mixture, sample = evaluation.fit_streamed(
@@ -178,7 +174,7 @@ def _checkpoint(config: DictConfig) -> Checkpoint | None:
     if config.checkpoint is None:
         return None
     path = Path(config.checkpoint).expanduser()
-    return Checkpoint(path, _CHECKPOINT_EVERY, config.checkpoint_seconds, config.resume)
+    return Checkpoint(path, seconds=config.checkpoint_seconds, resume=config.resume)
 
 
 def _sources(
@@ -194,7 +190,7 @@ def _sources(
         )
         return (train, test), None
     source = open_points(config.points, chunk_points=stream.chunk_points, max_range=stream.max_range)
-    return evaluation.split_source(source, config.test_share, config.seed), _SAMPLE_POINTS
+    return evaluation.split_source(source, config.test_share, config.seed), SAMPLE_POINTS
 
 
 # -- outputs ----------------------------------------------------------------------------------------------

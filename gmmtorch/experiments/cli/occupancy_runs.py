@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,7 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
     for resolution in dict.fromkeys(built.row["resolution"] for built in outcome.shown):
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
         panels = [report.MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
-        figures[f"map_{resolution:g}m"] = report.map_figure(panels, [trajectory], **_image_limits(shown))
+        figures[f"map_{resolution:g}m"] = _map_figure(shown)(panels, [trajectory])
         regions = report.busiest_regions(points, config.report.magnify) if len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):
             close = [report.MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
@@ -131,11 +131,11 @@ def _scene(shown: Sequence[Built], points: Tensor, trajectory: Tensor, surfaces:
     return report.map_scene_figure(points, trajectory, maps, resolution, surfaces, title=title)
 
 
-def _image_limits(shown: Sequence[Built]) -> dict[str, Any]:
-    """Limits of the image size for forms that integrate over cells, which are slow in 3D."""
+def _map_figure(shown: Sequence[Built]) -> Callable[..., Any]:
+    """The function that draws the maps; small pictures of forms that integrate over cells: slow in 3D."""
     if shown[0].asked.points.shape[1] == 3 and any(b.row["method"] in ("flux", "cone") for b in shown):
-        return {"max_pixels": 250, "max_queries": 100_000}
-    return {}
+        return partial(report.map_figure, max_pixels=250, max_queries=100_000)
+    return report.map_figure
 
 
 def _surfaces(outcome: Outcome) -> Components | None:

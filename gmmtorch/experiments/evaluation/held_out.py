@@ -188,22 +188,21 @@ def evaluate(
         for (method, factory), resolution in itertools.product(factories.items(), protocol.resolution):
             shared = factory.new_map if isinstance(factory, Form) else method
             if shared not in cache:
-                label = (
-                    f"{'mixture' if shared is not method else method}, {kept:.0%} of the {protocol.removal}"
-                )
+                made = "mixture" if isinstance(factory, Form) else method
+                label = f"{made}, {kept:.0%} of the {protocol.removal}"
                 cache[shared] = _build(factory(resolution), shown, label, resolution, on_event)
             built, seconds, seen = cache[shared]
             if not built.any_resolution:
                 del cache[shared]
             facts |= {"method": method, "resolution": float(resolution), "build_seconds": seconds}
             answer = _answerer(built, factory, resolution)
-            made = _scored(built, answer, asked[resolution], seen, protocol.unknown, seed, facts)
+            scored = _scored(built, answer, asked[resolution], seen, protocol.unknown, seed, facts)
             if protocol.save_map:
                 built.save(Path(protocol.save_map) / f"{method}_{kept:g}_{resolution:g}{built.suffix}")
-            outcome.rows.append(made.row)
+            outcome.rows.append(scored.row)
             on_row(outcome.rows)
             if kept == max(protocol.kept):
-                outcome.shown.append(made)
+                outcome.shown.append(scored)
     return outcome
 
 

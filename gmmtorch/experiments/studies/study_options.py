@@ -139,11 +139,7 @@ class ComponentCountStudy:
     n_components: Sequence[int] = option((16, 32, 64, 128, 256, 512, 1024), "numbers K of the curve")
     noise: float = 0.01  # standard deviation (m) of the range sensor
     multiples: Sequence[float] = (0.5, 1.0, 2.0, 4.0)  # of the noise, for the flat pieces and the trees
-    bandwidths: Sequence[float] = (
-        0.4,
-        0.2,
-        0.1,
-    )  # of the mean shift, see `count_modes`
+    bandwidths: Sequence[float] = (0.4, 0.2, 0.1)  # of the mean shift, see `count_modes`
     window: int = 20  # scans in the middle of the log that form the cloud; a map's window has as many
     window_components: Sequence[int] = (25, 50, 100, 200, 400, 800)  # of each window; empty: no maps
     resolution: float = 0.1
