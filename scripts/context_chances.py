@@ -20,6 +20,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -76,7 +77,7 @@ def learned(batches: Iterable[Quantized]) -> Tensor:
     """The chance of each slot in 1/256; 0: unknown."""
     tables = blank(context_model.first_tables())
     for values in batches:
-        stream = torch.zeros(256 + 96 * len(values) + 24 * len(values.origins), dtype=torch.uint8)
+        stream = np.zeros(256 + 96 * len(values) + 24 * len(values.origins), np.uint8)
         batch = coded(values, cell_exponent(values.places))
         assert context_coding(batch, tables, stream, writes=True) > 0
     return found(tables)
@@ -84,15 +85,16 @@ def learned(batches: Iterable[Quantized]) -> Tensor:
 
 def blank(first: ChanceTables) -> ChanceTables:
     return ChanceTables(
-        chances=torch.full_like(first.chances, 1 << 15),
-        n_coded=torch.zeros_like(first.n_coded),
-        rates=torch.tensor([(10 << 16) // (10 * n + 16) for n in range(MEMORY + 1)]),
+        chances=np.full_like(first.chances, 1 << 15),
+        n_coded=np.zeros_like(first.n_coded),
+        rates=np.array([(10 << 16) // (10 * n + 16) for n in range(MEMORY + 1)]),
         first_slot=first.first_slot,
     )
 
 
 def found(tables: ChanceTables) -> Tensor:
-    return torch.where(tables.n_coded < FEWEST, 0, (tables.chances >> 8).clamp(1, 255))
+    chances = np.where(tables.n_coded < FEWEST, 0, np.clip(tables.chances >> 8, 1, 255))
+    return torch.from_numpy(chances)
 
 
 def painted(scan: gt.Scan, generator: torch.Generator) -> gt.Scan:
@@ -127,7 +129,7 @@ def learned_attributes() -> Tensor:
         c = c.rearranged(spatial_order(c))
         for channel, rows in rows_of(c.attributes, c.covariances).items():
             for part in rows.split(DATAGRAM):
-                stream = torch.zeros(64 + 64 * part.numel(), dtype=torch.uint8)
+                stream = np.zeros(64 + 64 * part.numel(), np.uint8)
                 width, power = WIDTH[channel], number_model.powers()
                 assert number_coding(part.contiguous(), width, power, tables, stream, writes=True) > 0
     return found(tables)

@@ -18,18 +18,21 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import GmmTorchError
 
 A = TypeVar("A")
+Buffer = Tensor | NDArray[Any]
 logger = logging.getLogger(__name__)
 
 _TYPES = {
@@ -40,6 +43,7 @@ _TYPES = {
 }
 """The type in Warp of a number in C++, and the format of `struct` that places it in eight bytes."""
 _CPP = {torch.float64: "double", torch.float32: "float", torch.int32: "int32_t"}
+_NUMPY = {torch.float64: np.float64, torch.int64: np.int64, torch.int32: np.int32}
 _LEAST_ITEMS = 1 << 10  # of a thread of a CPU
 _BLOCK = 64
 """Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
@@ -58,7 +62,7 @@ class FusedKernel:
     """A C++ function, which runs once for each `item` (int64_t) from 0 up to the size of a launch.
 
     Its other parameters are int64_t, double, float, bool, pointers, or structures of these, whose fields are
-    passed one by one. A pointer is a tensor, or None for a null pointer.
+    passed one by one. A pointer is a tensor, an array on the CPU, or None for a null pointer.
 
     Args:
         source: the file with the function, relative to this one.
@@ -76,17 +80,18 @@ class FusedKernel:
         self._loaded: set[torch.device] = set()
         self._threads = threading.local()
 
-    def __call__(self, n_items: int, *arguments: Tensor | float | None) -> None:
+    def __call__(self, n_items: int, *arguments: Buffer | float | None) -> None:
         """Run the function for the items 0 … n_items − 1, on the device of the tensors.
 
         Tensors must be on one device and of the type of their pointers; this is not checked. One that is not
-        contiguous is copied if the function only reads it, and raises `GmmTorchError` otherwise. On a CPU the
-        items are split over `torch.get_num_threads()` threads, unless the kernel `shares`.
+        contiguous is copied if the function only reads it, and raises `GmmTorchError` otherwise. Arrays must
+        be contiguous. On a CPU the items are split over `torch.get_num_threads()` threads, unless the kernel
+        `shares`.
         """
         if n_items == 0:
             return
         values, tensors = self._values(arguments)
-        device = tensors[0].device
+        device = tensors[0].device if tensors else _CPU
         if device not in self._loaded:
             self.load(device)
         if device.type == "cuda":
@@ -154,14 +159,17 @@ class FusedKernel:
     def _packed(self) -> struct.Struct:
         return struct.Struct("=" + "".join("Q" if p.pointer else _TYPES[p.cpp][1] for p in self._parameters))
 
-    def _values(self, arguments: tuple[Tensor | float | None, ...]) -> tuple[list[float], list[Tensor]]:
-        """Numbers, with the address for a tensor and 0 for None; and the tensors, which a launch needs."""
+    def _values(self, arguments: tuple[Buffer | float | None, ...]) -> tuple[list[float], list[Tensor]]:
+        """Numbers, with the address for a tensor or array and 0 for None; and the tensors, which a launch
+        needs."""
         values: list[float] = []
         tensors = []
         for parameter, argument in zip(self._parameters, arguments, strict=True):
             if isinstance(argument, Tensor):
                 tensors.append(argument if argument.is_contiguous() else self._copied(parameter, argument))
                 values.append(tensors[-1].data_ptr())
+            elif isinstance(argument, np.ndarray):
+                values.append(argument.ctypes.data)
             else:
                 values.append(0 if argument is None else argument)
         return values, tensors
@@ -280,6 +288,17 @@ class Team(NamedTuple):
         if most is not None:
             n_blocks = min(n_blocks, -(-most // _BLOCK))
         return Team(n_blocks * _BLOCK, torch.zeros(1, dtype=torch.int32, device=device))
+
+
+def buffers(
+    device: torch.device, dtype: torch.dtype, sizes: Sequence[int], is_zero: bool = False
+) -> Sequence[Buffer]:
+    """Uninitialised numbers, or zeros, for a launch: an array of each size on a CPU, a tensor elsewhere."""
+    if device.type != "cpu":
+        return (torch.zeros if is_zero else torch.empty)(sum(sizes), dtype=dtype, device=device).split(sizes)
+    made = (np.zeros if is_zero else np.empty)(sum(sizes), _NUMPY[dtype])
+    ends = itertools.accumulate(sizes)
+    return [made[end - size : end] for size, end in zip(sizes, ends, strict=True)]
 
 
 def squad_size(device: torch.device) -> int:

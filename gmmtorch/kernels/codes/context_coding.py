@@ -6,10 +6,14 @@ import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.kernels.compiler import templated
+
+Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
 
 MOST_STEPS = 2048
 """For each byte of a batch, to find the ranks of its origins; about 0.1 ms."""
@@ -26,18 +30,18 @@ class CodedBatch:
     """
 
     side: int
-    axis_order: Tensor
-    deviation: Tensor
-    shear: Tensor
-    mean: Tensor
-    count: Tensor
-    max_range: Tensor
-    ids: Tensor
-    origins: Tensor
-    n_viewpoints: Tensor
-    seen_from: Tensor
-    share: Tensor
-    cells: Tensor
+    axis_order: Ints
+    deviation: Ints
+    shear: Ints
+    mean: Ints
+    count: Ints
+    max_range: Ints
+    ids: Ints
+    origins: Ints
+    n_viewpoints: Ints
+    seen_from: Ints
+    share: Ints
+    cells: Ints
 
     @property
     def dim(self) -> int:
@@ -49,47 +53,48 @@ class ChanceTables(NamedTuple):
     coded; both change. rates (M + 1,): in 1/65536, how far a bit moves a slot that has coded 0 … M bits.
     first_slot (F,): of the fields."""
 
-    chances: Tensor
-    n_coded: Tensor
-    rates: Tensor
-    first_slot: Tensor
+    chances: NDArray[np.int32]
+    n_coded: NDArray[np.int32]
+    rates: Ints
+    first_slot: Ints
 
 
-def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writes: bool) -> int:
+def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Bytes, writes: bool) -> int:
     """Write a batch to the stream (B,), uint8, or read it; returns the number of bytes used; −1 if the stream
     is damaged or too short; −2 if it takes more than `MOST_STEPS`. The viewpoints of a component are read
-    nearest first. All tensors are on the CPU."""
+    nearest first."""
     k, n_origins = len(batch.count), len(batch.origins)
-    result = torch.zeros(1, dtype=torch.int64)
+    result = np.zeros(1, np.int64)
     n_items = 8 * n_origins // 7 + 16  # of the tree
-    whole = torch.zeros(n_items * (1 + 2 * batch.dim) + 2 * n_origins, dtype=torch.int64)
-    waiting, box, *rows = whole.split([n_items, n_items * 2 * batch.dim, n_origins, n_origins])
-    numbers = torch.zeros(n_items + 2 * k * batch.dim, dtype=torch.float64)
-    distance, *shapes = numbers.split([n_items, k * batch.dim, k * batch.dim])
+    waiting, box = np.zeros(n_items, np.int64), np.zeros(n_items * 2 * batch.dim, np.int64)
+    rows, distance, shapes = (
+        np.zeros((2, n_origins), np.int64),
+        np.zeros(n_items),
+        np.zeros((2, batch.mean.size)),
+    )
     sizes = k, n_origins, len(batch.seen_from), batch.side
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)
     values = list(vars(batch).values())[1:-1]  # without side and cells
     kernel = _CODINGS[batch.dim, writes]
     kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result)
-    return int(result)
+    return int(result[0])
 
 
 _NUMBERS = templated("codes/number_coding.h", "number_coding", (True, False), rounds_each=True)
 
 
 def number_coding(
-    rows: Tensor, width: int, power: Tensor, tables: ChanceTables, stream: Tensor, writes: bool
+    rows: Tensor, width: int, power: Tensor, tables: ChanceTables, stream: Bytes, writes: bool
 ) -> int:
     """Write rows (K, n) of whole numbers, with `width` columns of the channel, to the stream (B,), uint8, or
     read them into zeros; returns the number of bytes used; −1 if the stream is damaged or too short.
 
     power (2 M + 1,): √2 to the powers −M … M, of which deviations are. All tensors are on the CPU.
     """
-    result = torch.zeros(1, dtype=torch.int64)
-    level, height = torch.zeros(width, dtype=torch.int64), torch.zeros(width, dtype=torch.float64)
+    result, level, height = np.zeros(1, np.int64), np.zeros(width, np.int64), np.zeros(width)
     sizes = (len(rows), rows.shape[1], width)
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (rows, power, len(power) // 2, level, height, *slots)
     _NUMBERS[writes](1, *sizes, *scratch, stream, len(stream), 0, result)
-    return int(result)
+    return int(result[0])

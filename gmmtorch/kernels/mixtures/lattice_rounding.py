@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -45,22 +46,21 @@ def lattice_rounding(
     Returns None if a component is, or would be, out of bounds.
 
     Args:
-        means (K, D), covariances (K, D, D): float64.
+        means (K, D), covariances (K, D, D): float64, on the CPU.
     """
     n, dim = means.shape
-    axis_order = torch.empty(n, dtype=torch.int64, device=means.device)
-    deviation, steps = axis_order.new_empty(n, dim), axis_order.new_empty(n, dim)
-    shear = axis_order.new_empty(n, dim * (dim - 1) // 2)
-    beyond = torch.zeros(1, dtype=torch.bool, device=means.device)
-    made = axis_order, deviation, shear, steps
+    widths = 1, dim, dim * (dim - 1) // 2, dim
+    parts = torch.empty(n * sum(widths), dtype=torch.int64).split([n * width for width in widths])
+    axis_order, deviation, shear, steps = (part.view(n, w) for part, w in zip(parts, widths, strict=True))
+    beyond, made = np.zeros(1, bool), (axis_order.view(n), deviation, shear, steps)
     _ROUNDINGS[dim](n, len(constants.orders), *constants, means, covariances, *made, beyond)
-    return None if bool(beyond) else made
+    return None if beyond[0] else made
 
 
 def lattice_restoring(
     axis_order: Tensor, deviation: Tensor, shear: Tensor, mean: Tensor, constants: LatticeConstants
 ) -> tuple[Tensor, Tensor]:
-    """Means (K, D) and covariances (K, D, D), float64,, of lattice points."""
+    """Means (K, D) and covariances (K, D, D), float64, of lattice points."""
     n, dim = mean.shape
     means = torch.empty(n, dim, dtype=torch.float64, device=mean.device)
     covariances = means.new_empty(n, dim, dim)

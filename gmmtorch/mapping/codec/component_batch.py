@@ -20,6 +20,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,6 +45,7 @@ from gmmtorch.mapping.codec.quantization import (
     LEAST_SIDE,
     ORIGIN_STEP,
     Quantized,
+    as_tensors,
     cell_exponent,
     cells_of,
     number_after,
@@ -190,20 +192,24 @@ def _read(data: bytes, most: int | None) -> Quantized:
         "share": (e,),
         "cells": (k, dim),
     }
-    b = CodedBatch(side, **{name: torch.zeros(shape, dtype=torch.int64) for name, shape in rows.items()})
+    b = CodedBatch(side, **{name: np.zeros(shape, np.int64) for name, shape in rows.items()})
     read_batch(b, stream)
-    places = Lattice(b.axis_order, b.deviation, b.shear, b.mean)
-    rank = torch.from_numpy(ranked(b.origins.numpy())[0])[b.seen_from]
-    order = torch.argsort(torch.arange(k).repeat_interleave(b.n_viewpoints) * n_origins + rank, stable=True)
-    seen_from, share = b.seen_from[order], b.share[order]
-    return Quantized(places, b.count, b.max_range.bool(), b.ids, b.origins, b.n_viewpoints, seen_from, share)
+    rank = ranked(b.origins)[0][b.seen_from]
+    order = np.argsort(np.arange(k).repeat(b.n_viewpoints) * n_origins + rank, kind="stable")
+    shapes, sights = (b.axis_order, b.deviation, b.shear, b.mean), (b.seen_from[order], b.share[order])
+    *places, count, ids, origins, n, seen_from, share = as_tensors(
+        *shapes, b.count, b.ids, b.origins, b.n_viewpoints, *sights
+    )
+    max_range = torch.from_numpy(b.max_range.astype(bool))
+    return Quantized(Lattice(*places), count, max_range, ids, origins, n, seen_from, share)
 
 
 def coded(values: Quantized, side: int) -> CodedBatch:
     """The values as the coder takes them."""
-    arrays = {**vars(values), **vars(values.places), "cells": torch.from_numpy(cells_of(values.places, side))}
-    del arrays["places"], arrays["attributes"]
-    return CodedBatch(side, **{name: array.long().contiguous() for name, array in arrays.items()})
+    tensors = {**vars(values), **vars(values.places)}
+    del tensors["places"], tensors["attributes"]
+    arrays = {name: np.ascontiguousarray(tensor.numpy(), np.int64) for name, tensor in tensors.items()}
+    return CodedBatch(side, **arrays, cells=np.ascontiguousarray(cells_of(values.places, side)))
 
 
 def _least_bytes(k: int, n_origins: int, e: int) -> int:

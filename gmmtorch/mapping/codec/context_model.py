@@ -32,6 +32,7 @@ from gmmtorch.mapping.codec.range_coder import NUMBER, RangeCoder, copied, first
 _NEIGHBOURS = 64  # components before a component among which its neighbours are searched
 _MOST_LEVELS = 52
 _TOO_SLOW = -2  # of the fused kernel
+_HERE = torch.empty(0)  # on the CPU
 
 FIELDS = {
     "FLAG": (4, 1),
@@ -60,9 +61,9 @@ FIELDS = {
 def write_batch(batch: CodedBatch) -> bytes:
     """The batch as bytes, without zeros at their end. Raises `InvalidArgumentError` for ids beyond 2^60."""
     size = 256 + 96 * len(batch.count) + 24 * (len(batch.origins) + len(batch.seen_from))
-    stream = torch.zeros(size, dtype=torch.uint8)
+    stream = np.zeros(size, np.uint8)
     try:
-        if is_fused(batch.mean):
+        if is_fused(_HERE):
             n = context_coding(batch, copied(first_tables()), stream, writes=True)
             if n == _TOO_SLOW:
                 raise InvalidArgumentError(
@@ -71,7 +72,7 @@ def write_batch(batch: CodedBatch) -> bytes:
                     'codec="float".'
                 )
             _require(n >= 0)
-            return stream[:n].numpy().tobytes().rstrip(b"\0")
+            return stream[:n].tobytes().rstrip(b"\0")
         writer = RangeCoder(first_tables())
         _Walk(writer, batch).run()
         return writer.to_bytes().rstrip(b"\0")
@@ -86,8 +87,8 @@ def read_batch(batch: CodedBatch, data: bytes) -> None:
     """Read what `write_batch` wrote into a batch of zeros of the same sizes; the viewpoints of a component
     are nearest first. Raises `DataError` for other bytes, as a batch has one form, and for those that take
     more time than a batch of that length may; the twin does not bound its time."""
-    if is_fused(batch.mean):
-        stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
+    if is_fused(_HERE):
+        stream = np.frombuffer(data or b"\0", np.uint8)
         _require(context_coding(batch, copied(first_tables()), stream, writes=False) >= 0)
     else:
         _Walk(RangeCoder(first_tables(), data), batch).run()
@@ -133,7 +134,7 @@ class _Walk:
         if not self.c.writes:
             for name, values in v.items():
                 found = getattr(self.b, name)
-                found.copy_(torch.tensor(values, dtype=torch.int64).reshape(found.shape))
+                found[...] = np.array(values, np.int64).reshape(found.shape)
 
     def _slots(self, field: str, context: int, size: int = NUMBER) -> int:
         return self._first[field] + context * size

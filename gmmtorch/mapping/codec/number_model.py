@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -35,10 +36,10 @@ def write_rows(rows: Tensor, width: int) -> bytes:
     if is_fused(rows):
         given = rows.contiguous().clone()
         for size in (_BYTES, _WIDEST):
-            stream = torch.zeros(64 + size * rows.numel(), dtype=torch.uint8)
+            stream = np.zeros(64 + size * rows.numel(), np.uint8)
             n = number_coding(given, width, powers(), copied(first_tables()), stream, writes=True)
             if n >= 0:
-                return stream[:n].numpy().tobytes().rstrip(b"\0")
+                return stream[:n].tobytes().rstrip(b"\0")
         raise AssertionError("numbers in range fit")
     writer = RangeCoder(first_tables())
     _walk(writer, rows.tolist(), width)
@@ -49,7 +50,7 @@ def read_rows(data: bytes, k: int, n: int, width: int) -> Tensor:
     """What `write_rows` wrote of K components. Raises `DataError` for other bytes."""
     if is_fused(torch.empty(0)):
         rows = torch.zeros(k, n, dtype=torch.int64)
-        stream = torch.frombuffer(bytearray(data or b"\0"), dtype=torch.uint8)
+        stream = np.frombuffer(data or b"\0", np.uint8)
         is_good = number_coding(rows, width, powers(), copied(first_tables()), stream, writes=False) >= 0
     else:
         table = [[0] * n for _ in range(k)]

@@ -88,20 +88,12 @@ class Quantized:
         begins = (np.cumsum(n_before) - n_before)[order]
         kept = np.repeat(begins - (np.cumsum(n) - n), n) + np.arange(n.sum())
 
-        def taken(values: Tensor, rows: Ints = order) -> Tensor:
-            return torch.from_numpy(values.numpy()[rows])
-
-        return replace(
-            self,
-            places=Lattice(*(taken(value) for value in vars(self.places).values())),
-            count=taken(self.count),
-            max_range=taken(self.max_range),
-            ids=taken(self.ids),
-            n_viewpoints=torch.from_numpy(n),
-            seen_from=taken(self.seen_from, kept),
-            share=taken(self.share, kept),
-            attributes=self.attributes.selected(rows),
-        )
+        each = (*vars(self.places).values(), self.count, self.ids)
+        arrays = *(value.numpy()[order] for value in each), n, self.seen_from.numpy()[kept]
+        *places, count, ids, n_viewpoints, seen_from, share = as_tensors(*arrays, self.share.numpy()[kept])
+        max_range, attributes = self.max_range[rows], self.attributes.selected(rows)
+        values = count, max_range, ids, self.origins, n_viewpoints, seen_from, share, attributes
+        return Quantized(Lattice(*places), *values)
 
     def restored(self) -> Components:
         """The components, float64 on the CPU."""
@@ -132,9 +124,23 @@ def quantize(components: Components) -> Quantized:
     are too large to be stored, see `lattice` and `LARGEST_COUNT`.
     """
     c = components.on_cpu()
-    places = lattice.nearest(c.means.double(), c.covariances.double())
-    count = _support_steps(c.support.double())
+    return _quantized(c, lattice.nearest(c.means.double(), c.covariances.double()))
+
+
+def _quantized(
+    c: Components, places: Lattice, rows: Ints | None = None, ids: Ints | None = None
+) -> Quantized:
+    """`quantize` of components at these places, on the CPU; in the order of `rows` (K,), with these ids."""
+    count, flags = _support_steps(c.support.double()), c.max_range
     by, seen, counts = c.seen_by.numpy(), c.seen_from.numpy(), c.seen_count.numpy().astype(np.float64)
+    shapes, attributes = [value.numpy() for value in vars(places).values()], c.attributes
+    if attributes:
+        attributes = attribute_block.moved(attributes, places.restored()[0] - c.means)
+    if rows is not None:
+        rank = np.empty_like(rows)
+        rank[rows] = np.arange(len(rows))
+        by, count, shapes = rank[by], count[rows], [value[rows] for value in shapes]
+        flags, attributes = flags[torch.from_numpy(rows)], attributes.selected(torch.from_numpy(rows))
     order = np.argsort(by, kind="stable")
     order = order[(counts[order] > 0) | (_largest(counts[order], by[order]) == 0)]
     by, seen, counts = by[order], seen[order], counts[order]
@@ -151,20 +157,19 @@ def quantize(components: Components) -> Quantized:
     begins = _begins(keys[order])
     kept = order[begins]
     by, counts = by[kept], np.add.reduceat(counts[order], begins) if len(kept) else counts
-    attributes = c.attributes
-    if attributes:
-        attributes = attribute_block.moved(attributes, places.restored()[0] - c.means)
-    return Quantized(
-        places=places,
-        count=count,
-        max_range=c.max_range,
-        ids=c.ids,
-        origins=torch.from_numpy(steps[first[used]]),
-        n_viewpoints=torch.from_numpy(np.bincount(by, minlength=len(c))),
-        seen_from=torch.from_numpy(number[rank[seen[kept]]]),
-        share=torch.from_numpy(np.where(count.numpy()[by] == NO_COUNT, 0, _share_steps(counts, by))),
-        attributes=attributes,
-    )
+    share = np.where(count[by] == NO_COUNT, 0, _share_steps(counts, by))
+    views = steps[first[used]], np.bincount(by, minlength=len(c)), number[rank[seen[kept]]], share
+    given = c.ids.numpy() if ids is None else ids
+    *made, counted, numbers, origins, n, seen_from, shares = as_tensors(*shapes, count, given, *views)
+    values = counted, flags, numbers, origins, n, seen_from, shares, attributes
+    return Quantized(Lattice(*made), *values)
+
+
+def as_tensors(*arrays: Ints) -> Sequence[Tensor]:
+    """Whole numbers as tensors, which share one memory."""
+    whole = torch.from_numpy(np.concatenate([array.reshape(-1) for array in arrays]))
+    parts = whole.split([array.size for array in arrays])
+    return [part.view(array.shape) for part, array in zip(parts, arrays, strict=True)]
 
 
 def quantized(components: Components) -> Components:
@@ -172,7 +177,7 @@ def quantized(components: Components) -> Components:
     return quantize(components).restored().to(components.means.device)
 
 
-def _support_steps(support: Tensor) -> Tensor:
+def _support_steps(support: Tensor) -> Ints:
     given = support.numpy()
     bad = ~((given >= 0) & (given <= MOST_POINTS))
     if bad.any():
@@ -184,11 +189,11 @@ def _support_steps(support: Tensor) -> Tensor:
     return count_steps(support)
 
 
-def count_steps(counts: Tensor) -> Tensor:
+def count_steps(counts: Tensor) -> Ints:
     """log2 of counts ≥ 0 in steps, or `NO_COUNT`; on the CPU."""
     given, least = counts.numpy(), 2.0 ** (LEAST_COUNT / PER_OCTAVE)
     steps = np.rint(np.log2(np.maximum(given, least)) * PER_OCTAVE).astype(np.int64)
-    return torch.from_numpy(np.where(given < least / 2, NO_COUNT, steps))
+    return np.where(given < least / 2, NO_COUNT, steps)
 
 
 def points_of(steps: Tensor) -> Tensor:
@@ -286,7 +291,8 @@ def spatial_order(components: Components) -> Tensor:
     Use it before components are numbered: ids take few bits only if they are consecutive.
     """
     means, covariances = on_cpu(components.means, components.covariances)
-    return order_of(lattice.nearest(means.double(), covariances.double())).to(components.means.device)
+    order = order_of(lattice.nearest(means.double(), covariances.double()))
+    return torch.from_numpy(order).to(components.means.device)
 
 
 def numbered(components: Components, robot: int, first: int) -> tuple[Components, int]:
@@ -295,44 +301,47 @@ def numbered(components: Components, robot: int, first: int) -> tuple[Components
 
     New components come last, in their spatial order.
     """
-    ids, *shapes = on_cpu(components.ids, components.means, components.covariances)
-    means, covariances = (part[ids[:, 1] < 0].double() for part in shapes)
-    ids, order = _numbering(ids, order_of(lattice.nearest(means, covariances)), robot, first)
+    given, *shapes = on_cpu(components.ids, components.means, components.covariances)
+    new = torch.from_numpy(np.flatnonzero(given.numpy()[:, 1] < 0))
+    means, covariances = shapes if len(new) == len(given) else (part[new] for part in shapes)
+    by_place = order_of(lattice.nearest(means.double(), covariances.double()))
+    made, order = _numbering(given.numpy(), by_place, robot, first)
+    ids, rows = as_tensors(made, order)
     device = components.ids.device
-    arranged = replace(components.rearranged(order.to(device)), ids=ids.to(device))
+    arranged = replace(components.rearranged(rows.to(device)), ids=ids.to(device))
     return arranged, number_after(ids, first)
 
 
 def number_after(ids: Tensor, next_number: int) -> int:
     """The sequence number of the next new component, after components with these ids (K, 2) exist."""
-    return max(next_number, int(ids[:, 1].max()) + 1 if len(ids) else 0)
+    numbers = on_cpu(ids[:, 1])[0].numpy()
+    return max(next_number, int(numbers.max(initial=-1)) + 1)
 
 
 def quantize_numbered(components: Components, robot: int, first: int) -> Quantized:
     """The same as `quantize(numbered(components, robot, first)[0])`, rounding every component once."""
-    values = quantize(components)
-    new = np.flatnonzero(values.ids.numpy()[:, 1] < 0)
-    ids, order = _numbering(values.ids, order_of(values.places, new), robot, first)
-    return replace(values.reordered(order), ids=ids)
+    c = components.on_cpu()
+    places, given = lattice.nearest(c.means.double(), c.covariances.double()), c.ids.numpy()
+    ids, order = _numbering(given, order_of(places, np.flatnonzero(given[:, 1] < 0)), robot, first)
+    return _quantized(c, places, order, ids)
 
 
-def _numbering(ids: Tensor, by_place: Tensor, robot: int, first: int) -> tuple[Tensor, Tensor]:
+def _numbering(ids: Ints, by_place: Ints, robot: int, first: int) -> tuple[Ints, Ints]:
     """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones in the
-    order `by_place` (J,) of these. On the CPU.
+    order `by_place` (J,) of these.
     """
-    given = ids.numpy()
-    is_new = given[:, 1] < 0
-    order = np.concatenate([np.flatnonzero(~is_new), np.flatnonzero(is_new)[by_place.numpy()]])
-    made = given[order]
+    is_new = ids[:, 1] < 0
+    order = np.concatenate([np.flatnonzero(~is_new), np.flatnonzero(is_new)[by_place]])
+    made = ids[order]
     made[len(made) - len(by_place) :, 0] = robot
     made[len(made) - len(by_place) :, 1] = first + np.arange(len(by_place))
-    return torch.from_numpy(made), torch.from_numpy(order)
+    return made, order
 
 
 # -- cells ----------------------------------------------------------------------------------------------
 
 
-def order_of(places: Lattice, rows: Ints | slice = slice(None)) -> Tensor:
+def order_of(places: Lattice, rows: Ints | slice = slice(None)) -> Ints:
     """The `spatial_order` (J,) of these components on the lattice: that of a Morton curve."""
     cells = cells_of(places, _FINEST)[rows] + offset_of(_FINEST)
     dim = places.dim
@@ -340,7 +349,7 @@ def order_of(places: Lattice, rows: Ints | slice = slice(None)) -> Tensor:
     # The bits of the coordinates, interleaved; those of ten levels at a time.
     digits = [(spread[cells >> 10 * n & 1023] << shift).sum(1) for n in range(4)]
     low, high = (digits[n] | digits[n + 1] << 10 * dim for n in (0, 2))
-    return torch.from_numpy(np.lexsort((low, high)))
+    return np.lexsort((low, high))
 
 
 def cells_of(places: Lattice, exponent: int) -> Ints:

@@ -11,10 +11,11 @@ import itertools
 import zlib
 from collections.abc import Sequence
 
-import torch
+import numpy as np
 
 from gmmtorch.errors import DataError
 from gmmtorch.kernels import ChanceTables
+from gmmtorch.mapping.codec.bitstream import Ints
 
 ONE = 1 << 16
 """A chance of one."""
@@ -30,23 +31,23 @@ def first_chances(packed: str, sizes: Sequence[int]) -> ChanceTables:
     """The tables before the first bit, of fields with these numbers of slots. packed: a byte for each slot,
     compressed, in base 85: the chance of a 0 in 1/256; 0: unknown."""
     text = base64.b85decode("".join(packed.split()))
-    chances = torch.tensor(list(zlib.decompress(text) if text else bytes(sum(sizes))))
+    chances = np.array(list(zlib.decompress(text) if text else bytes(sum(sizes))))
     return ChanceTables(
-        chances=torch.where(chances == 0, ONE // 2, chances << 8).int(),
-        n_coded=torch.where(chances == 0, 0, _MOST_TRAINED).int(),
+        chances=np.where(chances == 0, ONE // 2, chances << 8).astype(np.int32),
+        n_coded=np.where(chances == 0, 0, _MOST_TRAINED).astype(np.int32),
         rates=_rates(),
-        first_slot=torch.tensor([0, *itertools.accumulate(sizes[:-1])]),
+        first_slot=np.array([0, *itertools.accumulate(sizes[:-1])]),
     )
 
 
 def copied(tables: ChanceTables) -> ChanceTables:
     """Tables for one stream, as its bits change them."""
-    return tables._replace(chances=tables.chances.clone(), n_coded=tables.n_coded.clone())
+    return tables._replace(chances=tables.chances.copy(), n_coded=tables.n_coded.copy())
 
 
-def _rates() -> torch.Tensor:
+def _rates() -> Ints:
     """How far a bit moves a slot that has coded 0 … `MOST_CODED` bits, in 1/65536."""
-    return torch.tensor([10 * ONE // (10 * n + 16) for n in range(MOST_CODED + 1)])
+    return np.array([10 * ONE // (10 * n + 16) for n in range(MOST_CODED + 1)])
 
 
 class RangeCoder:

@@ -317,7 +317,7 @@ def encode_counts(
         write_number(writer, "sender", sender)
         if codec == "quantized":
             write_ids(writer, some.numpy())
-            writer.column(count_steps(gained).numpy())
+            writer.column(count_steps(gained))
             return make_datagram(Kind.COUNTS, writer.to_bytes())
         if codec == "thesis":
             return make_datagram(Kind.THESIS_COUNTS, writer.to_bytes() + encode_thesis_updates(some, gained))

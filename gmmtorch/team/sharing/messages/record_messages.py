@@ -278,7 +278,7 @@ def counters_message(key: int, points: dict[int, float]) -> CountersMessage:
     """Record `key` with the points of components by their keys, rounded as counts are."""
     components = np.array(sorted(points), np.int64)
     counts = torch.tensor([points[int(component)] for component in components], dtype=torch.float64)
-    return CountersMessage(key, components, count_steps(counts).numpy())
+    return CountersMessage(key, components, count_steps(counts))
 
 
 @dataclass(frozen=True, eq=False)

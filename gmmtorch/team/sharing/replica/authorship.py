@@ -134,14 +134,14 @@ class Author:
         order = order_of(values.places)
         first = self._numbers(len(order))
         numbered = np.arange(first, first + len(order))
-        values = replace(values.arranged(order), ids=ids_of(numbered))
+        values = replace(values.arranged(torch.from_numpy(order)), ids=ids_of(numbered))
         # Components are added by datagrams here, too, so that all robots of a team have the same batches.
         packets: list[Packet] = []
         for datagram, part in fitted(values, max_bytes, channels):
             added = self._records.add_components(part.restored(), bounded=False, complete=channels)
             packets.append((datagram, added))
         keys = np.empty_like(numbered)
-        keys[order.numpy()] = numbered
+        keys[order] = numbered
         successors = Intervals.of(numbered)
         superseded = self._supersede((old & self._records.held) - self._records.dead, successors)
         return keys, Intervals.union([superseded, *(keys for _, keys in packets)]), packets
