@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
@@ -105,6 +107,13 @@ def on_cpu(*tensors: Tensor) -> tuple[Tensor, ...]:
     data = torch.cat([tensors[i].contiguous().view(-1).view(torch.uint8) for i in order]).cpu()
     parts = dict(zip(order, data.split([sizes[i] for i in order]), strict=True))
     return tuple(parts[i].view(tensor.dtype).view(tensor.shape) for i, tensor in enumerate(tensors))
+
+
+def as_tensors(*arrays: NDArray[Any]) -> list[Tensor]:
+    """Arrays of one type as tensors, which share one memory."""
+    whole = torch.from_numpy(np.concatenate([array.reshape(-1) for array in arrays]))
+    parts = whole.split([array.size for array in arrays])
+    return [part.view(array.shape) for part, array in zip(parts, arrays, strict=True)]
 
 
 def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:

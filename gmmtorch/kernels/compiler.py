@@ -84,9 +84,8 @@ class FusedKernel:
         """Run the function for the items 0 … n_items − 1, on the device of the tensors.
 
         Tensors must be on one device and of the type of their pointers; this is not checked. One that is not
-        contiguous is copied if the function only reads it, and raises `GmmTorchError` otherwise. Arrays must
-        be contiguous. On a CPU the items are split over `torch.get_num_threads()` threads, unless the kernel
-        `shares`.
+        contiguous is copied if the function only reads it, and raises `GmmTorchError` otherwise. On a CPU the
+        items are split over `torch.get_num_threads()` threads, unless the kernel `shares`.
         """
         if n_items == 0:
             return
@@ -165,6 +164,8 @@ class FusedKernel:
         values: list[float] = []
         tensors = []
         for parameter, argument in zip(self._parameters, arguments, strict=True):
+            if isinstance(argument, np.ndarray) and not argument.flags.c_contiguous:
+                argument = torch.from_numpy(argument)
             if isinstance(argument, Tensor):
                 tensors.append(argument if argument.is_contiguous() else self._copied(parameter, argument))
                 values.append(tensors[-1].data_ptr())
@@ -293,12 +294,14 @@ class Team(NamedTuple):
 def buffers(
     device: torch.device, dtype: torch.dtype, sizes: Sequence[int], is_zero: bool = False
 ) -> Sequence[Buffer]:
-    """Uninitialised numbers, or zeros, for a launch: an array of each size on a CPU, a tensor elsewhere."""
+    """Uninitialised numbers, or zeros, for a launch: an array of each size on a CPU, a tensor elsewhere. An
+    array begins at a whole vector of `lanes.h`."""
     if device.type != "cpu":
         return (torch.zeros if is_zero else torch.empty)(sum(sizes), dtype=dtype, device=device).split(sizes)
-    made = (np.zeros if is_zero else np.empty)(sum(sizes), _NUMPY[dtype])
-    ends = itertools.accumulate(sizes)
-    return [made[end - size : end] for size, end in zip(sizes, ends, strict=True)]
+    room, width = [size + -size % 16 for size in sizes], dtype.itemsize
+    made = (np.zeros if is_zero else np.empty)(sum(room) + 16, _NUMPY[dtype])
+    begins = itertools.accumulate(room, initial=-made.ctypes.data % 64 // width)
+    return [made[begin : begin + size] for begin, size in zip(begins, sizes, strict=False)]
 
 
 def squad_size(device: torch.device) -> int:

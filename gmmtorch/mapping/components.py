@@ -126,11 +126,12 @@ class Components:
         seen_by, seen_from = [], []
         n_components = n_origins = 0
         for part in parts:
-            seen_by.append(part.seen_by + n_components)
-            seen_from.append(part.seen_from + n_origins)
+            seen_by.append(part.seen_by + n_components if n_components else part.seen_by)
+            seen_from.append(part.seen_from + n_origins if n_origins else part.seen_from)
             n_components += len(part)
             n_origins += part.origins.shape[0]
-        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in TENSORS}
+        names = [name for name in TENSORS if name not in ("seen_by", "seen_from")]
+        joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
         attributes = Attributes.concatenate(
             [part.attributes for part in parts], [len(part) for part in parts]
         )
@@ -144,7 +145,7 @@ class Components:
                 return self
             if torch.device(device).type == "cpu":
                 return self.on_cpu()
-            return self.changed(lambda value: value.to(device))
+            return self.changed(lambda value: value.to(device, non_blocking=True))
 
     def changed(self, change: Callable[[Tensor], Tensor]) -> Components:
         """The components with `change` applied to each tensor."""
@@ -152,6 +153,9 @@ class Components:
 
     def on_cpu(self) -> Components:
         """The components on the CPU, without gradients."""
+        given = (*self.tensors().values(), *self.attributes.tensors().values())
+        if not any(value.requires_grad or value.device.type != "cpu" for value in given):
+            return self
         return Components(*on_cpu(*self.tensors().values()), attributes=self.attributes.on_cpu())
 
     def cones(self) -> Cones:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike
+from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import (
     DAMAGED_CONTENT,
     DataError,
@@ -219,6 +219,7 @@ class GaussianMap(MapState):
         if len(frames) == 0:
             return
         broken: dict[int, GmmTorchError] = {}
+        intrinsics = as_tensor(intrinsics, "intrinsics", torch.float64, "cpu")
         whole = whole_frames(frames, broken, intrinsics, pixel_stride, max_range, depth_scale)
         first = next(whole, None)
         if first is None:

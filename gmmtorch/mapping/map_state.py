@@ -194,7 +194,8 @@ class MapState(DeviceModule):
             size = partial(file_size, rule=rule, settings=self.settings, next_number=self._next_number)
             options = rule, size, weight, self._doubts, before
             learned, self._next_doubts = windows.absorb(known, scans, *options)
-        return numbered(learned, self.robot, self._next_number)
+        made, next_number = numbered(learned, self.robot, self._next_number)
+        return made.to(known.means.device), next_number
 
     def _add(self, scan: Scan) -> None:
         """Adds a scan to the window, and makes the window final once it is full.

@@ -22,7 +22,7 @@ from torch import Tensor
 from gmmtorch.arrays import as_tensor
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.kernels import is_fused, is_pair_merges_fused, pair_merges
-from gmmtorch.linalg import check_symmetric, pack_symmetric, safe_cholesky
+from gmmtorch.linalg import as_tensors, check_symmetric, on_cpu, pack_symmetric, safe_cholesky
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.validation import checked_parameter
 
@@ -119,31 +119,35 @@ def merge_in_rounds(
     max_cost: float = math.inf,
     cost: str = "kullback_leibler",
     neighbors: int = 8,
+    device: torch.device | None = None,
 ) -> MergedInRounds:
     """The same as `simplify` with most_exact=0, of float64 parameters that are not checked.
 
     Components at one place, or with equal costs, are merged in an order that depends on that of the rows.
+    device: where the rounds run; None: where the parameters are, as the result is.
     """
     weights, means, covariances = parameters
-    rows = torch.arange(means.shape[0], device=means.device)
-    order, lead = rows, rows
-    if n_components < means.shape[0]:
-        low, high = torch.aminmax(means, dim=0)
-        order = means.index_select(1, (high - low).argmax(0, keepdim=True))[:, 0].argsort(stable=True)
+    k, here = len(means), means.device
+    places, along = on_cpu(means)[0].numpy(), np.arange(k)
+    if n_components < k:
+        along = places[:, (places.max(0) - places.min(0)).argmax()].argsort(kind="stable")
         found = None
         if is_fused(*parameters) and is_pair_merges_fused(means.shape[1]):
-            is_hellinger = cost == "hellinger"
-            found = pair_merges(order, *parameters, n_components, max_cost, is_hellinger, neighbors)
+            every = (torch.from_numpy(along), *parameters)
+            given = (part.to(device or here, non_blocking=True) for part in every)
+            found = pair_merges(*given, n_components, max_cost, cost == "hellinger", neighbors)
         if found is not None:
-            lead, members, made = found
-            is_first = lead == rows
-            first = is_first.nonzero().squeeze(1)
-            left = Parameters(*(part[first] for part in made))
-            return MergedInRounds(left, (is_first.cumsum(0) - 1)[lead], first, members[first])
-    given = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
-    merged, labels = _merge_in_rounds(given, n_components, max_cost, COSTS[cost], neighbors)
+            lead, members, *made = found
+            is_first = lead == np.arange(k)
+            first = np.flatnonzero(is_first)
+            rows = as_tensors((is_first.cumsum() - 1)[lead], first, members[first])
+            values = as_tensors(*(part[first] for part in made))
+            return MergedInRounds(Parameters(*(v.to(here) for v in values)), *(r.to(here) for r in rows))
+    order, numbers = torch.from_numpy(along).to(here), torch.arange(k, device=here)
+    left = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
+    merged, labels = _merge_in_rounds(left, n_components, max_cost, COSTS[cost], neighbors)
     labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), len(merged.weights))
-    first = rows.new_full(kept.shape, len(rows)).scatter_reduce_(0, labels, rows, "amin")
+    first = numbers.new_full(kept.shape, k).scatter_reduce_(0, labels, numbers, "amin")
     members = torch.bincount(labels, minlength=len(kept))
     return MergedInRounds(Parameters(*merged.at(kept)[:3]), labels, first, members)
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel, Team, templated
+from gmmtorch.kernels.compiler import FusedKernel, Team, buffers, templated
 
 KEY_BITS = 20
 """Bits of one cell coordinate in a key, as in `cells.h`."""
@@ -172,23 +172,23 @@ def _fused(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     depths, rows = _rows_of(views.depths, given)
     device, on_cpu = rows.device, rows.device.type == "cpu"
     n_places = 1 << (2 * max_cells).bit_length()
-    places = torch.full((n_places,), -1, dtype=torch.int32) if on_cpu else None
+    places = np.full(n_places, -1, np.int32) if on_cpu else None
     n_rows = max_cells if on_cpu else n_places  # on CUDA the place of a cell is its number
-    keys = torch.empty(n_rows, dtype=torch.int64) if on_cpu else torch.full((n_rows,), -1, device=device)
-    make = torch.empty if on_cpu else torch.zeros
-    sums = make(n_rows, _WIDTH, dtype=torch.float64, device=device)
-    counts = make(n_rows, n, dtype=torch.float64, device=device)
-    n_cells = torch.zeros(1, dtype=torch.int64, device=device)
+    sums, counts = buffers(device, torch.float64, (n_rows * _WIDTH, n_rows * n), is_zero=not on_cpu)
+    (n_cells,) = buffers(device, torch.int64, (1,), is_zero=True)
+    keys = np.empty(n_rows, np.int64) if on_cpu else torch.full((n_rows,), -1, device=device)
     n_items = 1 if on_cpu else max(-(-h // PATCH) * -(-w // PATCH) for h, w in (d.shape for d in depths))
     tables = max_cells, n_places, places, keys, sums, counts, n_cells
     _DEPTHS[depths[0].dtype](1 if on_cpu else n * n_items, rows, n, n_items, *tables)
-    found = int(n_cells)
+    found = int(n_cells[0])
     if found > max_cells:
         return None
     order = keys[:found].argsort() if on_cpu else keys.argsort()[n_rows - found :]  # a free place holds -1
-    ordered = sums.new_empty(found, 3), sums.new_empty(found, _WIDTH), counts.new_empty(found, n)
-    _ORDERED(found, order, keys, sums, counts, n, *ordered)
-    return DepthCells(*ordered)
+    made = torch.empty(found * (3 + _WIDTH + n), dtype=torch.float64, device=device)
+    parts = made.split([found * width for width in (3, _WIDTH, n)])
+    _ORDERED(found, order, keys, sums, counts, n, *parts)
+    corners, features, numbers = parts
+    return DepthCells(corners.view(found, 3), features.view(found, _WIDTH), numbers.view(found, n))
 
 
 def _rows_of(depths: Sequence[Tensor], given: np.ndarray) -> tuple[Sequence[Tensor], Tensor]:
@@ -347,10 +347,10 @@ def piece_cuts(
     if points.device.type != "cpu" or team is not None:
         return _team_cuts(given, rule, most, team)
     sizes = most * width, most * (2 * points.shape[1] + 2), most * 6, n
-    work = points.new_empty(sum(sizes)).split(sizes)
-    number, labels, n_pieces = torch.empty(most + n + 1, dtype=torch.int64).split((most, n, 1))
+    work, labels = buffers(points.device, torch.float64, sizes), torch.empty(n, dtype=torch.int64)
+    number, n_pieces = np.empty(most, np.int64), np.empty(1, np.int64)
     _CUTS[points.shape[1]](1, *given, *rule, *work, number, labels, n_pieces)
-    return labels, int(n_pieces)
+    return labels, int(n_pieces[0])
 
 
 def _team_cuts(

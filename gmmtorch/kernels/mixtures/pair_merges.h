@@ -27,7 +27,7 @@ struct MergeRule {
 };
 
 // At the first given row of each component that is left, its values and the number of its members. lead (K,):
-// that row of each given one. failed: whether a
+// that row of each given one. failed: 1 if a
 // covariance is not positive definite.
 struct Merged {
     double* left_weights;
@@ -35,7 +35,7 @@ struct Merged {
     double* left_covariances;
     int64_t* members;
     int64_t* lead;
-    bool* failed;
+    int* failed;
 };
 
 GMM_INLINE void lower(int64_t* place, int64_t value) {
@@ -126,7 +126,7 @@ struct Rounds {
         double squared;
         bool good = true;
         half[i] = half_log_det<DIM>(covariance + i * DIM * DIM, mean + i * DIM, squared, good);
-        if (!good) *out.failed = true;
+        if (!good) *out.failed = 1;
     }
 
     GMM_INLINE Gaussian<DIM> joined(int64_t a, int64_t b) const {
@@ -155,7 +155,7 @@ struct Rounds {
             const double log_det = half_log_det<DIM>(both.covariance, both.mean, squared, good);
             found = weight[a] * (log_det - half[a]) + weight[b] * (log_det - half[b]);
         }
-        if (!good) *out.failed = true;
+        if (!good) *out.failed = 1;
         return maximum(found, 0.0);
     }
 

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from gmmtorch.kernels.compiler import Team, templated
+from gmmtorch.kernels.compiler import Team, buffers, templated
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 _MERGES = templated("mixtures/pair_merges.h", "pair_merges", range(2, 7), shares=True, rounds_each=True)
 SELECTION_COUNTS = 16 * 256
@@ -32,7 +37,7 @@ def pair_merges(
     limit: float,
     is_hellinger: bool,
     neighbors: int,
-) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]] | None:
+) -> tuple[Ints, Ints, Floats, Floats, Floats] | None:
     """Merge pairs of K components until `least` are left, or the cost of every pair is above `limit`.
 
     order: (K,), their rows along an axis. weights (K,), means (K, D), covariances (K, D, D), float64.
@@ -42,43 +47,44 @@ def pair_merges(
     not positive definite, or its determinant is beyond 10^±280.
     """
     k, dim = means.shape
-    given = weights, means, covariances
-    made = weights.new_empty(k), weights.new_empty(k, dim), weights.new_empty(k, dim, dim)
-    members, lead = torch.empty_like(order), torch.empty_like(order)
     block = 8 * max(4, math.isqrt(k) // 8)  # about as many blocks as rows in each
-    scratch = weights.new_empty((k + 2 * block) * (3 + 3 * dim + dim**2 + 2 * neighbors))
-    whole = order.new_empty(k * (5 + neighbors))
-    counts = torch.empty(SELECTION_COUNTS, dtype=torch.int32, device=order.device)
-    failed = torch.zeros(1, dtype=torch.bool, device=order.device)
-    team = Team.of(order.device)
-    rule = least, limit, is_hellinger, neighbors, block
+    n_scratch, device = (k + 2 * block) * (3 + 3 * dim + dim**2 + 2 * neighbors), order.device
+    sizes = k * (1 + dim + dim * dim), n_scratch
+    found, scratch = buffers(device, torch.float64, sizes)
+    rows, whole = buffers(device, torch.int64, (2 * k, k * (5 + neighbors)))
+    counts, failed = buffers(device, torch.int32, (SELECTION_COUNTS, 1), is_zero=True)
+    made = found[:k], found[k : k + k * dim], found[k + k * dim :]
+    team, rule = Team.of(device), (least, limit, is_hellinger, neighbors, block)
+    given = k, order, weights, means, covariances
     _MERGES[dim](
-        team.n, *team, k, order, *given, *rule, *made, members, lead, failed, scratch, whole, counts,
+        team.n, *team, *given, *rule, *made, rows[:k], rows[k:], failed, scratch, whole, counts,
     )  # fmt: skip
-    return None if bool(failed) else (lead, members, made)
+    if isinstance(found, Tensor):  # one wait for all
+        both = torch.cat([found.view(torch.int64), rows, failed.long()]).cpu().numpy()
+        found, rows, failed = both[: len(found)].view(np.float64), both[len(found) : -1], both[-1:]
+    shapes = found[k : k + k * dim].reshape(k, dim), found[k + k * dim :].reshape(k, dim, dim)
+    return None if failed[0] else (rows[k:], rows[:k], found[:k], *shapes)
 
 
 _CHOICES = templated("mixtures/viewpoint_choice.h", "viewpoint_choice", (2, 3), shares=True, rounds_each=True)
 
 
 def viewpoint_choice(
-    by: Tensor, seen_from: Tensor, count: Tensor, origins: Tensor, support: Tensor, most: int, limit: int
-) -> tuple[Tensor, Tensor | None, bool]:
+    by: Ints, seen_from: Ints, count: Floats, origins: Tensor, support: Tensor, most: int, limit: int
+) -> tuple[Floats, NDArray[np.bool_], bool]:
     """Choose at most `most` of the viewpoints (E,) of each of K components, and at most `limit` in all.
 
-    by, seen_from, count (E,), origins (S, D), support (K,): as in `Components`.
+    by, seen_from, count (E,), origins (S, D), support (K,): as in `Components`, on the CPU.
 
-    Returns counts (E,), those of the chosen ones scaled to add up to the support; the rows of the chosen ones
-    (J,), None for all; and whether it is known that every origin has one.
+    Returns counts (E,), those of the chosen ones scaled to add up to the support; which are chosen (E,); and
+    whether it is known that every origin has one.
     """
-    device, (n_origins, dim), e = by.device, origins.shape, len(by)
-    given = by.argsort(stable=True), by, seen_from, count, origins
-    gain, nearest, scaled = torch.empty(3, e, dtype=count.dtype, device=device)
-    flags = torch.zeros(e + n_origins, dtype=torch.bool, device=device)
-    counts = torch.zeros(SELECTION_COUNTS + 2, dtype=torch.int32, device=device)
-    team, is_kept = Team.of(device), flags[:e]
-    choice = gain, nearest, scaled, is_kept, flags[e:], counts[SELECTION_COUNTS:]
+    (n_origins, dim), e = origins.shape, len(by)
+    given = by.argsort(kind="stable"), by, seen_from, count, origins
+    gain, nearest, scaled = np.empty((3, e))
+    is_kept, is_used = np.zeros(e, bool), np.zeros(n_origins, bool)
+    counts, found = np.zeros(SELECTION_COUNTS, np.int32), np.zeros(2, np.int32)
+    choice, team = (gain, nearest, scaled, is_kept, is_used, found), Team(1, None)
     sizes, table = (len(support), e), (n_origins, support)
     _CHOICES[dim](team.n, *team, *sizes, *given, *table, *choice, most, limit, counts)
-    n_kept, n_used = counts[SELECTION_COUNTS:].tolist()
-    return scaled, None if n_kept == e else is_kept.nonzero().squeeze(1), n_used == n_origins
+    return scaled, is_kept, int(found[1]) == n_origins

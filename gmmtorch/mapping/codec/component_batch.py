@@ -34,6 +34,7 @@ from gmmtorch.errors import (
 )
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.kernels import CodedBatch
+from gmmtorch.linalg import as_tensors
 from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
@@ -45,7 +46,6 @@ from gmmtorch.mapping.codec.quantization import (
     LEAST_SIDE,
     ORIGIN_STEP,
     Quantized,
-    as_tensors,
     cell_exponent,
     cells_of,
     number_after,

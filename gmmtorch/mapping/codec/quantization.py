@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.linalg import all_equal, on_cpu
+from gmmtorch.linalg import all_equal, as_tensors, on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec import attribute_block, lattice
 from gmmtorch.mapping.codec.bitstream import Ints
@@ -140,7 +140,8 @@ def _quantized(
         rank = np.empty_like(rows)
         rank[rows] = np.arange(len(rows))
         by, count, shapes = rank[by], count[rows], [value[rows] for value in shapes]
-        flags, attributes = flags[torch.from_numpy(rows)], attributes.selected(torch.from_numpy(rows))
+        flags = torch.from_numpy(flags.numpy()[rows])
+        attributes = attributes.selected(torch.from_numpy(rows)) if attributes else attributes
     order = np.argsort(by, kind="stable")
     order = order[(counts[order] > 0) | (_largest(counts[order], by[order]) == 0)]
     by, seen, counts = by[order], seen[order], counts[order]
@@ -163,13 +164,6 @@ def _quantized(
     *made, counted, numbers, origins, n, seen_from, shares = as_tensors(*shapes, count, given, *views)
     values = counted, flags, numbers, origins, n, seen_from, shares, attributes
     return Quantized(Lattice(*made), *values)
-
-
-def as_tensors(*arrays: Ints) -> Sequence[Tensor]:
-    """Whole numbers as tensors, which share one memory."""
-    whole = torch.from_numpy(np.concatenate([array.reshape(-1) for array in arrays]))
-    parts = whole.split([array.size for array in arrays])
-    return [part.view(array.shape) for part, array in zip(parts, arrays, strict=True)]
 
 
 def quantized(components: Components) -> Components:

@@ -19,7 +19,7 @@ from torch import Tensor
 from gmmtorch.arrays import ArrayLike
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels import DepthCells, DepthViews, cell_features, depth_cells, range_sums
-from gmmtorch.linalg import on_cpu
+from gmmtorch.linalg import as_tensors, on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes, learned, of_scans
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.merging import AssignedViewpoints, AssignViewpoints
@@ -100,7 +100,7 @@ class DepthFrame:
     def pixels(self) -> Tensor:
         """The pixels (N,) that are not left out, row by row."""
         depth = self.depth
-        valid = (depth > 0) & (depth < self.max_range) & torch.isfinite(depth)
+        valid = (depth > 0) & (depth < self.max_range)  # also not NaN, nor infinite
         return valid.flatten().nonzero().squeeze(1)
 
     def _seen(self, pixels: Tensor) -> Tensor:
@@ -275,7 +275,7 @@ def fit_window(
     """Components of the returns of S scans, then `max_range` components of the ends of no-return beams.
 
     `empty_fit`: for the no-return beams, if it differs from `fit`. `fit.rule.free_points` points on each
-    other beam are treated as ends of no-return beams. Components are not numbered.
+    other beam are treated as ends of no-return beams. Components are not numbered, and on the CPU.
     """
     origins = torch.stack([scan.origin.double() for scan in scans])
     channels = [scan.attributes for scan in scans]
@@ -302,12 +302,12 @@ def fit_points(
     """Components of S clouds of points (N_s, D), each observed from its sensor origin (S, D), in metres.
 
     `attributes`: the channels of the points of each cloud. `max_range`: the points are ends of no-return
-    beams. Components are not numbered.
+    beams. Components are not numbered, and on the CPU.
     """
     sizes = [cloud.shape[0] for cloud in clouds]
     n_points, dim = sum(sizes), origins.shape[1]
     if n_points == 0:
-        return Components.empty(dim, origins.device)
+        return Components.empty(dim)
     points = torch.cat(list(clouds)).double()
     ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
@@ -326,27 +326,28 @@ def fit_points(
     if any(attributes):
         known = learned(of_scans(attributes, sizes), cells, owner, found.means, found.covariances)
     found = found._replace(means=found.means + center)
+    counts, origins, *parts = on_cpu(counts, origins, *found)
+    found, known = Parameters(*parts), Attributes() if known is None else known.on_cpu()
     return _components(found, viewpoints(counts, found.weights, n_learned), origins, max_range, known)
 
 
 def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
     """Components of the points of depth images, each observed from its camera; see `fit_points`.
 
-    The images are summed into cells at once, without a list of their points. Components are not numbered.
+    The images are summed into cells at once, without a list of their points. Components are not numbered,
+    and on the CPU.
     """
-    origins = torch.stack([frame.pose.translation for frame in frames])
-    origins = origins.to(frames[0].depth.device, non_blocking=True)
     if fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
     cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)
     if cells.weight.shape[0] == 0:
-        return Components.empty(3, origins.device)
+        return Components.empty(3)
     found = _mixture_of(cells.features, cells.weight, 3, fit)
     owner = most_likely_component(cells.features, found)
     counts = cells.counts.new_zeros(found.weights.shape[0], len(frames)).index_add_(0, owner, cells.counts)
-    counts, weights = on_cpu(counts, found.weights)
-    found = found._replace(means=found.means + cells.center)
-    assigned = viewpoints(counts, weights, int(counts.sum()))
+    counts, *parts = on_cpu(counts, found.weights, found.means + cells.center, found.covariances)
+    found, origins = Parameters(*parts), torch.stack([frame.pose.translation for frame in frames])
+    assigned = viewpoints(counts, found.weights, int(counts.numpy().sum()))
     return _components(found, assigned, origins, max_range=False)
 
 
@@ -357,14 +358,16 @@ def _components(
     max_range: bool,
     attributes: Attributes | None = None,
 ) -> Components:
-    """The components that keep a viewpoint; not numbered."""
-    kept, support, seen_by, seen_from, seen_count = (part.to(origins.device) for part in assigned)
-    ids = torch.zeros(support.shape[0], 2, dtype=torch.int64, device=origins.device)
+    """The components that keep a viewpoint; not numbered. All is on the CPU."""
+    rows, weights, by, seen, counts = assigned
+    ids = np.zeros((len(rows), 2), np.int64)
     ids[:, 1] = UNNUMBERED
-    flags = torch.full_like(ids[:, 0], max_range, dtype=torch.bool)
-    shapes, viewpoints = (found.means[kept], found.covariances[kept]), (seen_by, seen_from, seen_count)
-    known = Attributes() if attributes is None else attributes.selected(kept)
-    return Components(*shapes, support, flags, ids, origins.double(), *viewpoints, attributes=known)
+    numbers, seen_by, seen_from = as_tensors(ids, by, seen)
+    shapes = found.means.numpy()[rows], found.covariances.numpy()[rows]
+    *parts, seen_count = as_tensors(*shapes, weights, counts)
+    known = attributes.selected(torch.from_numpy(rows)) if attributes else Attributes()
+    flags, viewpoints = torch.from_numpy(np.full(len(rows), max_range)), (seen_by, seen_from, seen_count)
+    return Components(*parts, flags, numbers, origins.double(), *viewpoints, attributes=known)
 
 
 def _points_before(scan: Scan, n: int) -> Tensor:

@@ -10,24 +10,26 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_number, check_whole
 from gmmtorch.kernels import is_fused, viewpoint_choice
-from gmmtorch.linalg import on_cpu
+from gmmtorch.linalg import as_tensors
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mixture import MergedInRounds, Parameters, merge_in_rounds
 
-AssignedViewpoints = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+Floats, Ints = NDArray[np.float64], NDArray[np.int64]
+AssignedViewpoints = tuple[Ints, Floats, Ints, Ints, Floats]
 """kept (K′,): rows of the components that keep at least one viewpoint; their support (K′,); and seen_by,
-seen_from, seen_count (E,) of their viewpoints, as in `Components`. On the CPU."""
+seen_from, seen_count (E,) of their viewpoints, as in `Components`."""
 
 AssignViewpoints = Callable[[Tensor, Tensor, float], AssignedViewpoints]
-"""From the points (K, S) of each component in each scan, the weights (K,) and the number of points.
-
-A component that is no point's most likely one has no points; it is dropped.
+"""From the points (K, S) of each component in each scan, the weights (K,) and the number of points. All is on
+the CPU. A component that is no point's most likely one has no points; it is dropped.
 """
 
 
@@ -38,13 +40,13 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
     """
 
     def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
-        counts, weights = on_cpu(counts, weights)
-        kept = (counts.sum(1) > 0).nonzero().squeeze(1)
-        counts, support = counts[kept], weights[kept]
-        support = support * (n_points * weight / support.sum())
-        counts *= (support / counts.sum(1))[:, None]
-        seen_by, seen_from = (counts > 0).nonzero(as_tuple=True)
-        return kept, support, seen_by, seen_from, counts[seen_by, seen_from]
+        of_each = counts.numpy().sum(1)
+        kept = np.flatnonzero(of_each > 0)
+        support = weights.numpy()[kept]
+        support = support * (n_points * weight * (1 / torch.from_numpy(support).sum().numpy()))
+        share = counts.numpy()[kept] * (support / of_each[kept])[:, None]
+        seen_by, seen_from = share.nonzero()
+        return kept, support, seen_by, seen_from, share[seen_by, seen_from]
 
     return assign
 
@@ -57,7 +59,6 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
     """
 
     def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
-        counts, weights = on_cpu(counts, weights)
         support = weights * n_points
         n_kept = min(max_origins, counts.shape[1])
         if n_kept < counts.shape[1]:
@@ -70,21 +71,21 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
         has_one = (share > 0).any(1)
         number = torch.cumsum(has_one.long(), 0) - 1
         kept, seen_count = has_one.nonzero().squeeze(1), share[seen_by, seen_from]
-        return kept, support[kept], number[seen_by], seen_from, seen_count
+        made = kept, support[kept], number[seen_by], seen_from, seen_count
+        return tuple(part.numpy() for part in made)  # type: ignore[return-value]
 
     return assign
 
 
-def union_of_viewpoints(components: Components, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def union_of_viewpoints(components: Components, labels: Ints) -> tuple[Ints, Ints, Floats]:
     """seen_by, seen_from, seen_count (E′,) of components merged by label (K,); counts of an origin add up.
 
     Each pair of component and origin occurs once, in rising order.
     """
-    n_origins = max(1, components.origins.shape[0])
-    keys, row = torch.unique(
-        labels[components.seen_by] * n_origins + components.seen_from, return_inverse=True
-    )
-    count = components.seen_count.new_zeros(keys.shape[0]).index_add_(0, row, components.seen_count)
+    n_origins = max(1, len(components.origins))
+    given = labels[components.seen_by.numpy()] * n_origins + components.seen_from.numpy()
+    keys, row = np.unique(given, return_inverse=True)
+    count = np.bincount(row, components.seen_count.numpy(), len(keys))
     return keys // n_origins, keys % n_origins, count
 
 
@@ -103,21 +104,23 @@ def limit_origins(components: Components, max_origins: int, mean_origins: float 
     check_whole("max_origins", max_origins, 1)
     if mean_origins is not None and not 1 <= mean_origins < math.inf:
         raise InvalidArgumentError(f"mean_origins={mean_origins} must be at least 1.")
-    limit = len(components) * (max_origins if mean_origins is None else mean_origins)
-    by, seen_from, count = components.seen_by, components.seen_from, components.seen_count
-    given = by, seen_from, count, components.origins, components.support
-    choose = viewpoint_choice if is_fused(*given) else _choice
-    count, kept, all_used = choose(*given, max_origins, int(min(limit, len(by))))
-    if kept is not None:
-        by, seen_from, count = by[kept], seen_from[kept], count[kept]
-    limited = replace(components, seen_by=by, seen_from=seen_from, seen_count=count)
-    return limited if all_used else limited.with_used_origins()
+    c, device = components.on_cpu(), components.means.device
+    limit = len(c) * (max_origins if mean_origins is None else mean_origins)
+    by, seen_from, count = c.seen_by.numpy(), c.seen_from.numpy(), c.seen_count.numpy()
+    given = by, seen_from, count, c.origins, c.support
+    choose = viewpoint_choice if is_fused(c.origins, c.support) else _choice
+    count, is_kept, all_used = choose(*given, max_origins, int(min(limit, len(by))))
+    limited = replace(c, seen_count=torch.from_numpy(count))
+    if not is_kept.all():
+        limited = limited.with_viewpoints(torch.from_numpy(np.flatnonzero(is_kept)))
+    return (limited if all_used else limited.with_used_origins()).to(device)
 
 
 def _choice(
-    by: Tensor, seen_from: Tensor, count: Tensor, origins: Tensor, support: Tensor, most: int, limit: int
-) -> tuple[Tensor, Tensor | None, bool]:
+    rows: Ints, seen: Ints, counts: Floats, origins: Tensor, support: Tensor, most: int, limit: int
+) -> tuple[Floats, NDArray[np.bool_], bool]:
     """The twin of `viewpoint_choice`."""
+    by, seen_from, count = torch.from_numpy(rows), torch.from_numpy(seen), torch.from_numpy(counts)
     n_rows, is_kept = len(by), count > 0
     of_each = torch.zeros_like(support).index_add_(0, by, is_kept.to(support))
     is_used = torch.zeros_like(origins[:, 0]).index_fill_(0, seen_from, 1.0)
@@ -130,9 +133,7 @@ def _choice(
         is_kept = torch.zeros_like(is_kept).index_fill_(0, largest, True) & (gain >= 0)
     total = torch.zeros_like(support).index_add_(0, by, torch.where(is_kept, count, 0.0))
     scaled = count * (support / total.clamp_min(torch.finfo(total.dtype).tiny))[by]
-    if fits and n_left == n_rows:
-        return scaled, None, n_used == len(origins)
-    return scaled, is_kept.nonzero().squeeze(1), False
+    return scaled.numpy(), is_kept.numpy(), fits and n_left == n_rows and n_used == len(origins)
 
 
 def _gains(by: Tensor, count: Tensor, position: Tensor, n: int, most: int) -> Tensor:
@@ -160,15 +161,17 @@ Size = Callable[[Components], int]
 
 
 def united(components: Components, found: MergedInRounds) -> Components:
-    """The components after the merges that were found for them. Viewpoints are united.
+    """The components, on the CPU, after the merges that were found for them. Viewpoints are united.
 
     A component that is not merged stays bit-identical. A merged component is `UNNUMBERED` and has the robot
     of its first member.
     """
     first, is_merged = found.first, found.members > 1
     weights, means, covariances = found.parameters
-    robots, numbers = components.ids[first].unbind(1)
-    seen_by, seen_from, seen_count = union_of_viewpoints(components, found.labels)
+    ids, flags = components.ids.numpy()[first.numpy()], components.max_range.numpy()[first.numpy()]
+    ids[is_merged.numpy(), 1] = UNNUMBERED
+    by, seen, seen_count = union_of_viewpoints(components, found.labels.numpy())
+    numbers, seen_by, seen_from = as_tensors(ids, by, seen)
     attributes = components.attributes
     if attributes:
         rows, groups = is_merged[found.labels].nonzero().squeeze(1), is_merged.nonzero().squeeze(1)
@@ -183,16 +186,19 @@ def united(components: Components, found: MergedInRounds) -> Components:
         covariances=covariances,
         attributes=attributes,
         support=weights,
-        max_range=components.max_range[first],
-        ids=torch.stack([robots, torch.where(is_merged, UNNUMBERED, numbers)], 1),
+        max_range=torch.from_numpy(flags),
+        ids=numbers,
         seen_by=seen_by,
         seen_from=seen_from,
-        seen_count=seen_count,
+        seen_count=torch.from_numpy(seen_count),
     )
 
 
 def compact(
-    components: Components, max_components: int | None = None, max_cost: float | None = None
+    components: Components,
+    max_components: int | None = None,
+    max_cost: float | None = None,
+    device: torch.device | None = None,
 ) -> Components:
     """Merges pairs, cheapest first: all pairs up to `max_cost`, then more until `max_components` are left.
 
@@ -203,6 +209,7 @@ def compact(
         max_components: largest number of components. The next pair is the one with the smallest bound on the
             Kullback–Leibler divergence of the map, weighted by support (Runnalls).
         max_cost: squared Hellinger distance, 0 to 1, up to which two components are always merged.
+        device: where pairs are searched; None: where the components are, as the result is.
 
     Raises `InvalidArgumentError` if both are None, or for a value out of range.
     """
@@ -210,27 +217,31 @@ def compact(
         raise InvalidArgumentError("max_components=None and max_cost=None: give one, or both.")
     if max_components is not None:
         check_whole("max_components", max_components, 1)
+    here, c = components.means.device, components.on_cpu()
+    device = device or here
     if max_cost is not None:
         check_number("max_cost", max_cost)
-        components = _merged_by_kind(components, None, max_cost)
-    if max_components is not None and len(components) > max_components:
-        components = _merged_by_kind(components, max_components, None)
-    return components
+        c = _merged_by_kind(c, None, max_cost, device)
+    if max_components is not None and len(c) > max_components:
+        c = _merged_by_kind(c, max_components, None, device)
+    return c.to(here)
 
 
-def _merged_by_kind(components: Components, limit: int | None, max_cost: float | None) -> Components:
-    n, n_empty = len(components), int(components.max_range.sum())
+def _merged_by_kind(
+    components: Components, limit: int | None, max_cost: float | None, device: torch.device
+) -> Components:
+    n, n_empty = len(components), np.count_nonzero(components.max_range.numpy())
     if n_empty in (0, n):
-        return united(components, _merged(components, n_empty == 0, limit, max_cost))
+        return united(components, _merged(components, n_empty == 0, limit, max_cost, device))
     surfaces, empty = ((components.max_range == flag).nonzero().squeeze(1) for flag in (False, True))
     if limit == 1:  # a budget of one component for both kinds: surfaces stay
-        return _merged_by_kind(components.selected(surfaces), limit, max_cost)
+        return _merged_by_kind(components.selected(surfaces), limit, max_cost, device)
     limits: tuple[int | None, int | None] = (None, None)
     if limit is not None:  # both kinds shrink in proportion
         share = min(max(1, round(limit * n_empty / n)), limit - 1)
         limits = limit - share, share
-    one = _merged(components.selected(surfaces), True, limits[0], max_cost)
-    other = _merged(components.selected(empty), False, limits[1], max_cost)
+    one = _merged(components.selected(surfaces), True, limits[0], max_cost, device)
+    other = _merged(components.selected(empty), False, limits[1], max_cost, device)
     order = torch.cat([surfaces[one.first], empty[other.first]]).argsort()
     place = torch.empty_like(order).scatter_(0, order, torch.arange(len(order), device=order.device))
     labels = torch.empty_like(components.max_range, dtype=torch.int64)
@@ -243,18 +254,24 @@ def _merged_by_kind(components: Components, limit: int | None, max_cost: float |
 
 
 def _merged(
-    components: Components, with_attributes: bool, limit: int | None, max_cost: float | None
+    components: Components,
+    with_attributes: bool,
+    limit: int | None,
+    max_cost: float | None,
+    device: torch.device,
 ) -> MergedInRounds:
     """Merges among components of one kind, up to one of the limits."""
     given = Parameters(components.support, components.means, components.covariances)
-    if components.attributes and with_attributes:  # numbers among them are further dimensions
+    is_joint = bool(components.attributes) and with_attributes
+    if is_joint:  # numbers among them are further dimensions
         given = Parameters(given.weights, *moments.joint_moments(components.attributes, *given))
     if max_cost is None:
-        found = merge_in_rounds(given, limit or 1)
+        found = merge_in_rounds(given, limit or 1, device=device)
     else:
-        found = merge_in_rounds(given, 1, max_cost, "hellinger")
-    weights, means, covariances = found.parameters
-    dim = components.dim
+        found = merge_in_rounds(given, 1, max_cost, "hellinger", device=device)
+    if not is_joint:
+        return found
+    (weights, means, covariances), dim = found.parameters, components.dim
     return found._replace(parameters=Parameters(weights, means[:, :dim], covariances[:, :dim, :dim]))
 
 
@@ -270,26 +287,30 @@ def compact_to_bytes(
 
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
-    components = limit_origins(components, max_origins, mean_origins)
+    device = components.means.device
+    components = limit_origins(
+        components.on_cpu(), max_origins, mean_origins
+    )  # as the size is measured there
     last: tuple[int, int] | None = None
     numbered = True
     while (k := len(components)) and (taken := size(components)) > max_bytes:
         if numbered:
             numbered = False
-            if bool((components.ids[:, 1] != UNNUMBERED).any()):
-                robots = components.ids[:, 0]
-                unnumbered = torch.stack([robots, torch.full_like(robots, UNNUMBERED)], 1)
-                components = replace(components, ids=unnumbered)
+            ids = components.ids.numpy().copy()
+            if (ids[:, 1] != UNNUMBERED).any():
+                ids[:, 1] = UNNUMBERED
+                components = replace(components, ids=torch.from_numpy(ids))
                 continue
         if k > 1:
             power = math.log(last[1] / taken) / math.log(last[0] / k) if last else 1.0
             wanted = min(k - 1, int(k * (0.999 * max_bytes / taken) ** (1 / max(power, 0.25))))
             last = k, taken
-            components = limit_origins(compact(components, max(1, wanted)), max_origins, mean_origins)
+            fewer = compact(components, max(1, wanted), device=device)
+            components = limit_origins(fewer, max_origins, mean_origins)
         elif components.seen_by.shape[0] > 1:
             components = limit_origins(components, 1)
         else:
             raise InvalidArgumentError(
                 f"max_bytes={max_bytes} is less than the {taken} that one component takes; allow more."
             )
-    return components
+    return components.to(device)

@@ -114,6 +114,8 @@ def _absorb_window(
         if rule.novelty is not None:
             components, scans = _explain(components, scans, rule.novelty, weight)
         learned = _learned(scans, rule, weight)
+    if rule.max_bytes is not None and rule.forget != CONTRADICTION:
+        components = components.on_cpu()  # for the codec, which measures them
     components, doubts = joined(components, learned, window, rule, doubts)
     return _within_budget(components, rule, size) if len(learned) else components, doubts
 
@@ -195,7 +197,8 @@ def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Gener
     if isinstance(rule, WindowedRule):
         return learn_window(scans, replace(rule, iterations=1), generator)
     quick = replace(rule, window_components=max(1, rule.window_components // 2))
-    return merging.limit_origins(_learned(scans, quick, 1.0, 0), rule.max_origins, rule.mean_origins)
+    learned = _learned(scans, quick, 1.0, 0).to(scans[0].points.device)
+    return merging.limit_origins(learned, rule.max_origins, rule.mean_origins)
 
 
 def learns_in_parts(rule: LearningRule) -> bool:
@@ -307,6 +310,7 @@ def joined(
     The noise of the rule must be set if a scan has a return. Raises `InvalidArgumentError` for a half-life if
     a scan has no time.
     """
+    learned = learned.to(known.means.device)
     if rule.forget == FORGET_OFF:
         return Components.concatenate([known, learned]), doubts
     if rule.forget == CONTRADICTION:
@@ -450,7 +454,7 @@ def few_points(blocks: Sequence[Block], points: Tensor, sides: Sequence[float]) 
         low, high = boxes_of(blocks, max(sides), cutoff)
         met = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).tolist()
         blocks = [block for block, is_met in zip(blocks, met, strict=True) if is_met] or blocks[:1]
-    known = Components.concatenate([block.components for block in blocks])
+    known = Components.concatenate([block.components.to(points.device) for block in blocks])
     widest = max(sides) * max(0.5 * known.dim**0.5, cutoff / 12**0.5)
     if is_fused(points, known.means):
         views = known.means, known.covariances, known.max_range, known.origins

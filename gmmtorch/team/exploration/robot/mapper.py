@@ -330,7 +330,8 @@ class GmmMapper(Mapper):
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
         """The components of the novel beams."""
         scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
-        return fit_window([scan], self._rule.surface_fit(), all_origins(), self._rule.empty_fit())
+        fits = self._rule.surface_fit(), all_origins(), self._rule.empty_fit()
+        return fit_window([scan], *fits).to(frame.ends.device)
 
     def _count(self, frame: DepthFrame, chosen: Tensor, weight: int) -> Tensor:
         """Adds the beams `chosen` (M,) to the counts of the components that explain them, with a weight each;
