@@ -43,7 +43,8 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
         of_each = counts.numpy().sum(1)
         kept = np.flatnonzero(of_each > 0)
         support = weights.numpy()[kept]
-        support = support * (n_points * weight * (1 / torch.from_numpy(support).sum().numpy()))
+        total = torch.from_numpy(support).sum().numpy()  # in torch's order
+        support = support * (n_points * weight * (1 / max(float(total), 1e-300)))
         share = counts.numpy()[kept] * (support / of_each[kept])[:, None]
         seen_by, seen_from = share.nonzero()
         return kept, support, seen_by, seen_from, share[seen_by, seen_from]
