@@ -43,7 +43,12 @@ _TYPES = {
 }
 """The type in Warp of a number in C++, and the format of `struct` that places it in eight bytes."""
 _CPP = {torch.float64: "double", torch.float32: "float", torch.int32: "int32_t"}
-_NUMPY = {torch.float64: np.float64, torch.int64: np.int64, torch.int32: np.int32}
+_NUMPY: dict[torch.dtype, type] = {
+    torch.float64: np.float64,
+    torch.float32: np.float32,
+    torch.int64: np.int64,
+    torch.int32: np.int32,
+}
 _LEAST_ITEMS = 1 << 10  # of a thread of a CPU
 _BLOCK = 64
 """Items of a block on CUDA. Few, because many kernels have some thousand items, each with much work: they
@@ -311,7 +316,7 @@ def buffers(
     if device.type != "cpu":
         return (torch.zeros if is_zero else torch.empty)(sum(sizes), dtype=dtype, device=device).split(sizes)
     room, width = [size + -size % 16 for size in sizes], dtype.itemsize
-    made = (np.zeros if is_zero else np.empty)(sum(room) + 16, _NUMPY[dtype])
+    made: NDArray[Any] = (np.zeros if is_zero else np.empty)(sum(room) + 16, _NUMPY[dtype])
     begins = itertools.accumulate(room, initial=-made.ctypes.data % 64 // width)
     return [made[begin : begin + size] for begin, size in zip(begins, sizes, strict=False)]
 

@@ -133,16 +133,18 @@ def merge_in_rounds(
         along = places[:, (places.max(0) - places.min(0)).argmax()].argsort(kind="stable")
         found = None
         if is_fused(*parameters) and is_pair_merges_fused(means.shape[1]):
-            every = (torch.from_numpy(along), *parameters)
-            given = (part.to(device or here, non_blocking=True) for part in every)
-            found = pair_merges(*given, n_components, max_cost, cost == "hellinger", neighbors)
+            at, rule = device or here, (n_components, max_cost, cost == "hellinger", neighbors)
+            w, m, c, rows = (
+                part.to(at, non_blocking=True) for part in (*parameters, torch.from_numpy(along))
+            )
+            found = pair_merges(rows, w, m, c, *rule)
         if found is not None:
-            lead, members, *made = found
+            lead, n_members, *made = found
             is_first = lead == np.arange(k)
-            first = np.flatnonzero(is_first)
-            rows = as_tensors((is_first.cumsum() - 1)[lead], first, members[first])
-            values = as_tensors(*(part[first] for part in made))
-            return MergedInRounds(Parameters(*(v.to(here) for v in values)), *(r.to(here) for r in rows))
+            begins = np.flatnonzero(is_first)
+            whole = as_tensors((is_first.cumsum() - 1)[lead], begins, n_members[begins])
+            values = as_tensors(*(part[begins] for part in made))
+            return MergedInRounds(Parameters(*(v.to(here) for v in values)), *(r.to(here) for r in whole))
     order, numbers = torch.from_numpy(along).to(here), torch.arange(k, device=here)
     left = Gaussians.of(Parameters(weights[order], means[order], covariances[order]))
     merged, labels = _merge_in_rounds(left, n_components, max_cost, COSTS[cost], neighbors)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 from exploration.voxel_worlds import EVALUATOR, PRIMITIVES, Explorer, surroundings_from, task_of
@@ -24,16 +25,17 @@ class MadeUp:
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        self.calls: list[torch.Tensor] = []
+        self.calls: list[np.ndarray] = []
 
-    def keys(self, poses: torch.Tensor) -> torch.Tensor:
+    def keys(self, poses: torch.Tensor) -> np.ndarray:
         yaw = (poses[:, 3:] / (math.pi / 4)).round().long() % 8
-        return torch.cat([(poses[:, :3] / 0.5).round().long(), yaw], 1)
+        return torch.cat([(poses[:, :3] / 0.5).round().long(), yaw], 1).numpy()
 
-    def poses(self, keys: torch.Tensor) -> torch.Tensor:
+    def poses(self, keys: np.ndarray) -> torch.Tensor:
+        keys = torch.from_numpy(keys)
         return torch.cat([keys[:, :3] * 0.5, keys[:, 3:] * (math.pi / 4)], 1).double()
 
-    def evaluate(self, local_map, keys: torch.Tensor) -> ViewValues:
+    def evaluate(self, local_map, keys: np.ndarray) -> ViewValues:
         self.calls.append(keys)
         gain, measured = [], []
         for key in keys.tolist():
@@ -118,7 +120,7 @@ def test_search_evaluates_each_view_once_in_batches():
     task, evaluator = task_in(ROOM, MIDDLE), MadeUp(0)
     search_tree(PRIMITIVES, SearchRule(n_rounds=4, n_leaves=32), task, ViewCache(task, evaluator))
     assert len(evaluator.calls) <= 5
-    keys = [tuple(key) for key in torch.cat(evaluator.calls).tolist()]
+    keys = [tuple(key) for key in np.concatenate(evaluator.calls).tolist()]
     assert len(keys) == len(set(keys))
     assert 40 < len(keys) <= 129
 

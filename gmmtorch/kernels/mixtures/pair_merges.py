@@ -59,11 +59,15 @@ def pair_merges(
     _MERGES[dim](
         team.n, *team, *given, *rule, *made, rows[:k], rows[k:], failed, scratch, whole, counts,
     )  # fmt: skip
-    if isinstance(found, Tensor):  # one wait for all
-        both = torch.cat([found.view(torch.int64), rows, failed.long()]).cpu().numpy()
+    if not isinstance(found, np.ndarray):  # one wait for all
+        every = [torch.as_tensor(part).view(-1) for part in (rows, failed)]
+        both = torch.cat([found.view(torch.int64), *(part.long() for part in every)]).cpu().numpy()
         found, rows, failed = both[: len(found)].view(np.float64), both[len(found) : -1], both[-1:]
-    shapes = found[k : k + k * dim].reshape(k, dim), found[k + k * dim :].reshape(k, dim, dim)
-    return None if failed[0] else (rows[k:], rows[:k], found[:k], *shapes)
+    if failed[0]:
+        return None
+    values, numbers = np.asarray(found), np.asarray(rows)
+    shapes = values[k : k + k * dim].reshape(k, dim), values[k + k * dim :].reshape(k, dim, dim)
+    return numbers[k:], numbers[:k], values[:k], *shapes
 
 
 _CHOICES = templated("mixtures/viewpoint_choice.h", "viewpoint_choice", (2, 3), shares=True, rounds_each=True)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import FusedKernel
+from gmmtorch.kernels.compiler import FusedKernel, buffers
 
 REACHED = 0.05
 """A cell counts as measured in full if a beam reaches it with this probability."""
@@ -84,14 +84,15 @@ def _fused(
     n_templates, n_columns = beams.volumes.shape
     n_own = beams.per_view if device.type == "cpu" else 1
     n_items = n_views * beams.per_view // n_own
-    gain, taken = torch.zeros(2, n_views, cells.n_blocks, device=device)
+    both = torch.zeros(2, n_views, cells.n_blocks, device=device)
+    gain, taken = both[0], both[1]
+    (scratch,) = buffers(device, torch.float32, [n_items * 6 * n_columns])
     sizes = beams.per_view, n_own, n_templates, n_columns, beams.leading.shape[-1], len(beams.kernel)
     tables = beams.lengths, beams.leading, beams.ahead, beams.volumes, beams.kernel
     places = cells.offsets, cells.occupancy, cells.block
     rule = shannon_information, math.log(IMAGE_ODDS)
-    made = torch.empty(n_items, 6, n_columns, device=device), gain, taken
     given = *cells.shape, *sizes, cells.n_blocks
-    _KERNEL(n_items, cameras, yaw, *given, *tables, *places, *rule, *made)
+    _KERNEL(n_items, cameras, yaw, *given, *tables, *places, *rule, scratch, gain, taken)
     return gain, taken
 
 

@@ -364,10 +364,11 @@ def _components(
     ids[:, 1] = UNNUMBERED
     numbers, seen_by, seen_from = as_tensors(ids, by, seen)
     shapes = found.means.numpy()[rows], found.covariances.numpy()[rows]
-    *parts, seen_count = as_tensors(*shapes, weights, counts)
+    means, covariances, support, seen_count = as_tensors(*shapes, weights, counts)
     known = attributes.selected(torch.from_numpy(rows)) if attributes else Attributes()
     flags, viewpoints = torch.from_numpy(np.full(len(rows), max_range)), (seen_by, seen_from, seen_count)
-    return Components(*parts, flags, numbers, origins.double(), *viewpoints, attributes=known)
+    parts = means, covariances, support, flags, numbers, origins.double()
+    return Components(*parts, *viewpoints, attributes=known)
 
 
 def _points_before(scan: Scan, n: int) -> Tensor:

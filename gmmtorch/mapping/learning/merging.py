@@ -22,7 +22,8 @@ from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mixture import MergedInRounds, Parameters, merge_in_rounds
 
-Floats, Ints = NDArray[np.float64], NDArray[np.int64]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 AssignedViewpoints = tuple[Ints, Floats, Ints, Ints, Floats]
 """kept (K′,): rows of the components that keep at least one viewpoint; their support (K′,); and seen_by,
 seen_from, seen_count (E,) of their viewpoints, as in `Components`."""
@@ -86,7 +87,7 @@ def union_of_viewpoints(components: Components, labels: Ints) -> tuple[Ints, Int
     n_origins = max(1, len(components.origins))
     given = labels[components.seen_by.numpy()] * n_origins + components.seen_from.numpy()
     keys, row = np.unique(given, return_inverse=True)
-    count = np.bincount(row, components.seen_count.numpy(), len(keys))
+    count: Floats = np.bincount(row, components.seen_count.numpy(), len(keys)).astype(np.float64, copy=False)
     return keys // n_origins, keys % n_origins, count
 
 

@@ -19,7 +19,7 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     ViewsMessage,
     encode_views,
     quantized_poses,
-    quantized_values,
+    quantized_value,
 )
 from gmmtorch.team.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
@@ -329,8 +329,8 @@ def _rounded(value: float, now: float) -> tuple[float, float]:
         raise InvalidArgumentError(
             f"value={value} and now={now} s must be finite, the time up to {LATEST:g}."
         )
-    rounded = quantized_values(torch.tensor([max(-_LARGEST_VALUE, min(value, _LARGEST_VALUE))]))
-    return _in_ticks(now), float(rounded[0]) + 0.0  # −0 becomes 0
+    rounded = quantized_value(max(-_LARGEST_VALUE, min(value, _LARGEST_VALUE)))
+    return _in_ticks(now), rounded + 0.0  # −0 becomes 0
 
 
 def _in_ticks(seconds: float) -> float:

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_whole
 from gmmtorch.kernels import Beams, Cells, information_by_block
+from gmmtorch.linalg import as_tensors
+from gmmtorch.mapping import Ints
 from gmmtorch.occupancy import check_resolution
 from gmmtorch.team.exploration.planning.collision_checking import LocalMap
 from gmmtorch.team.exploration.planning.planner_interface import PlanningTask
@@ -225,36 +227,37 @@ class ViewEvaluator:
             kernel.to(device),
         )
         self._empty: Cells | None = None  # of the last shape
-        self._windows: weakref.WeakKeyDictionary[LocalMap, tuple[Cells, Tensor]] = weakref.WeakKeyDictionary()
+        self._windows: weakref.WeakKeyDictionary[LocalMap, tuple[Cells, Tensor, Ints]]
+        self._windows = weakref.WeakKeyDictionary()
 
-    def keys(self, poses: Tensor) -> Tensor:
-        """Return lattice poses (V, 4) int64 nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
+    def keys(self, poses: Tensor) -> Ints:
+        """Return lattice poses (V, 4) nearest to poses (V, 4): x, y, z, yaw; metres, radians, world."""
         if poses.ndim != 2 or poses.shape[1] != 4:
             raise InvalidArgumentError(
                 f"poses have shape {tuple(poses.shape)}; expected (V, 4): x, y, z, yaw."
             )
-        given = poses.double().numpy()
+        given = poses.numpy().astype(np.float64, copy=False)
         place = (given[:, :3] / self.resolution - 0.5) / self.stride
         if not ((np.abs(place) < 2**52).all() and (np.abs(given[:, 3]) < 2**32).all()):
             raise InvalidArgumentError(
                 "poses must be finite metres and radians, less than 2⁵² cells from the origin."
             )
         yaw = np.rint(given[:, 3:] * (self.n_yaws / (2 * math.pi))) % self.n_yaws
-        return torch.from_numpy(np.concatenate([np.rint(place), yaw], 1).astype(np.int64))
+        return np.concatenate([np.rint(place), yaw], 1).astype(np.int64)
 
-    def poses(self, keys: Tensor) -> Tensor:
+    def poses(self, keys: Ints) -> Tensor:
         """Return poses (V, 4) float64 of lattice poses (V, 4), yaw in [0, 2π)."""
-        given = keys.numpy().astype(np.float64)
+        given = keys.astype(np.float64)
         place = (given[:, :3] * self.stride + 0.5) * self.resolution
         return torch.from_numpy(np.concatenate([place, given[:, 3:] * (2 * math.pi / self.n_yaws)], 1))
 
-    def evaluate(self, local_map: LocalMap, keys: Tensor) -> ViewValues:
+    def evaluate(self, local_map: LocalMap, keys: Ints) -> ViewValues:
         """Evaluate each view (V, 4) alone. Beams end at the map's border; a camera outside sees nothing."""
-        cells, enough = self._window(local_map)
-        cameras = (keys[:, :3] * self.stride - local_map.low).to(self.device)
-        gain, taken = information_by_block(
-            self._beams, cells, cameras, keys[:, 3].to(self.device), self.information == "fsmi"
-        )
+        cells, enough, low = self._window(local_map)
+        cameras, yaw = as_tensors(keys[:, :3] * self.stride - low, keys[:, 3])
+        if self.device.type != "cpu":
+            cameras, yaw = cameras.to(self.device), yaw.to(self.device)
+        gain, taken = information_by_block(self._beams, cells, cameras, yaw, self.information == "fsmi")
         measured = taken.div_(enough).clamp_max_(1)
         if self.device.type != "cpu":
             gain, measured = torch.stack([gain, measured]).cpu()
@@ -266,9 +269,9 @@ class ViewEvaluator:
             return torch.ones(self._window(local_map)[0].n_blocks)
         return (1 - self.evaluate(local_map, self.keys(poses)).measured).prod(0)
 
-    def _window(self, local_map: LocalMap) -> tuple[Cells, Tensor]:
-        """The cells of a local map, and what a view must take from each block (G,) to measure it, for all
-        evaluations of the map."""
+    def _window(self, local_map: LocalMap) -> tuple[Cells, Tensor, Ints]:
+        """The cells of a local map, what a view must take from each block (G,) to measure it, and the lowest
+        cell (3,), for all evaluations of the map."""
         window = self._windows.get(local_map)
         if window is not None:
             return window
@@ -287,8 +290,8 @@ class ViewEvaluator:
         cells = self._empty._replace(occupancy=occupancy)
         unresolved = torch.bincount(cells.block, (1 - occupancy).mul_(occupancy), cells.n_blocks)
         enough = (_SATURATED * unresolved).clamp_min_(torch.finfo(torch.float32).tiny)
-        self._windows[local_map] = cells, enough
-        return cells, enough
+        self._windows[local_map] = cells, enough, local_map.low.cpu().numpy()
+        return self._windows[local_map]
 
     def _laid_out(self, shape: tuple[int, ...]) -> Cells:
         """The index tables of all local maps of a shape, without occupancy."""
@@ -318,7 +321,7 @@ class ViewCache:
     def __init__(self, task: PlanningTask, evaluator: ViewEvaluator) -> None:
         self._local_map, self._evaluator = task.local_map, evaluator
         self._row: dict[tuple[int, ...], int] = {}
-        self._keys: list[Tensor] = []
+        self._keys: list[Ints] = []
         n_blocks = len(task.residual)
         # Rows beyond those of `_row` are spare.
         self._gain, self._left = torch.zeros(0, n_blocks), torch.zeros(0, n_blocks)
@@ -336,7 +339,7 @@ class ViewCache:
             fresh = keys if len(new) == len(keys) else keys[new]
             self._store(len(self._row) - len(new), self._evaluator.evaluate(self._local_map, fresh))
             self._keys.append(fresh)
-        return torch.tensor([self._row[name] for name in names], dtype=torch.int64)
+        return torch.from_numpy(np.array([self._row[name] for name in names], np.int64))
 
     def _store(self, begin: int, values: ViewValues) -> None:
         """Store values in the rows from `begin` on."""
@@ -363,7 +366,7 @@ class ViewCache:
 
     def views(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """Return all evaluated poses (V, 4) and their values (V,) given `residual` (G,)."""
-        return self._evaluator.poses(torch.cat(self._keys)), self._gain[: len(self._row)] @ residual
+        return self._evaluator.poses(np.concatenate(self._keys)), self._gain[: len(self._row)] @ residual
 
 
 _DECAY = 0.25  # share of what a view promises that is discounted after its image

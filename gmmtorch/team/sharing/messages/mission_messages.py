@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
@@ -173,7 +174,10 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
         raise InvalidArgumentError(f"ids: {error}") from error
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
-    steps, values = _pose_steps("poses", m.poses)[order], _value_steps(m.values)[order]
+    steps, values = (
+        _pose_steps("poses", m.poses)[order],
+        _value_steps(m.values.detach().double().cpu().numpy())[order],
+    )
     times = _ticks("stamps", m.stamps, STAMP_TICKS)[order]
 
     def part(begin: int, end: int) -> bytes:
@@ -201,7 +205,7 @@ def read_views(body: bytes) -> ViewsMessage:
     stamps = _seconds_of(reader.column(len(keys)), STAMP_TICKS)
     removed = read_intervals(reader, 0, END)
     reader.finish()
-    return ViewsMessage(ids_of(keys), poses, _values(values), stamps, removed)
+    return ViewsMessage(ids_of(keys), poses, torch.from_numpy(_values(values)), stamps, removed)
 
 
 def encode_plan(
@@ -265,12 +269,16 @@ def _read_size(reader: BitReader) -> int:
 
 def quantized_values(values: Tensor) -> Tensor:
     """Values (V,) of views as messages round them: to four significant bits, so by up to 6 %."""
-    return _values(_value_steps(values))
+    return torch.from_numpy(_values(_value_steps(values.detach().double().cpu().numpy())))
 
 
-def _value_steps(values: Tensor) -> Ints:
+def quantized_value(value: float) -> float:
+    """A value as `quantized_values` rounds it."""
+    return float(_values(_value_steps(np.array([value])))[0])
+
+
+def _value_steps(rows: NDArray[np.float64]) -> Ints:
     """The highest bits (V,) of values as float16, rounded, with their sign."""
-    rows = values.detach().double().cpu().numpy()
     if rows.ndim != 1 or not (np.abs(rows) <= np.finfo(np.float16).max).all():
         raise InvalidArgumentError("values must be a row of numbers up to 65504, the most of float16.")
     halves = np.abs(rows).astype(np.float16).view(np.uint16).astype(np.int64)
@@ -279,9 +287,9 @@ def _value_steps(values: Tensor) -> Ints:
     return np.where(rows < 0, -size, size)
 
 
-def _values(steps: Ints) -> Tensor:
+def _values(steps: Ints) -> NDArray[np.float64]:
     size = (np.abs(steps) << _VALUE_SHIFT).astype(np.uint16).view(np.float16).astype(np.float64)
-    return torch.from_numpy(np.where(steps < 0, -size, size))
+    return np.where(steps < 0, -size, size)
 
 
 # -- poses and times ------------------------------------------------------------------------------------
