@@ -308,7 +308,7 @@ def numbered(components: Components, robot: int, first: int) -> tuple[Components
 
 def number_after(ids: Tensor, next_number: int) -> int:
     """The sequence number of the next new component, after components with these ids (K, 2) exist."""
-    numbers = on_cpu(ids[:, 1])[0].numpy()
+    numbers = on_cpu(ids)[0].numpy()[:, 1]
     return max(next_number, int(numbers.max(initial=-1)) + 1)
 
 
