@@ -57,7 +57,8 @@ GMM_INLINE Lanes::whole integer(vec x) { return __builtin_convertvector(x, Lanes
 GMM_INLINE vec fused(vec a, vec b, vec c) { return __builtin_elementwise_fma(a, b, c); }
 GMM_INLINE double get(vec v, int i) { return v[i]; }
 GMM_INLINE int64_t get(Lanes::whole v, int i) { return v[i]; }
-GMM_INLINE void set(vec& v, int i, double x) { v[i] = x; }
+// In memory: where a loop over lanes is not unrolled, v[i] = x would copy the whole vector for each lane.
+GMM_INLINE void set(vec& v, int i, double x) { ((double*)&v)[i] = x; }
 
 GMM_INLINE double largest(vec v) {
     vec other = __builtin_shufflevector(v, v, 4, 5, 6, 7, 4, 5, 6, 7);

@@ -89,7 +89,7 @@ Found = tuple[Pose, Tensor]
 
 
 class _Tried(NamedTuple):
-    """Of H headings: the turns (H,) from the last expected pose, the rotations (H, 2, 2), the cells (H, N, 3)
+    """Of H headings: the turns (H,) from the last expected pose, the rotations (H, 2, 2), the cells (H, N, 2)
     of the points, and the turns (H, B) from the expected poses; and how many observations a point stands for.
     """
 
@@ -135,10 +135,10 @@ class PoseSearch:
             count_in_grid(misses, starts, ends, tuple(shape), low=self._low)
             crossed = (misses > 0).view(shape)
             raster = torch.where(crossed & (shade == 0), FREE, raster)
-        self._levels = [raster[..., None]]
+        self._levels = [raster]
         for level in range(_LEVELS - 1):
             step = 1 << level
-            wide = torch.nn.functional.pad(self._levels[-1], (0, 0, 0, step, 0, step), value=UNKNOWN)
+            wide = torch.nn.functional.pad(self._levels[-1], (0, step, 0, step), value=UNKNOWN)
             wide = torch.maximum(wide[:-step], wide[step:])
             self._levels.append(torch.maximum(wide[:, :-step], wide[:, step:]))
 
@@ -179,7 +179,7 @@ class PoseSearch:
         width = 1 << level
         n = math.ceil(expected.max_step / self.cell / width)
         side = torch.arange(-n, n + 1)
-        flat = torch.nn.functional.pad(torch.cartesian_prod(side, side) * width, (0, 1)).to(tried.cells)
+        flat = (torch.cartesian_prod(side, side) * width).to(tried.cells)
         n_turns = len(tried.angles)
         heading = torch.arange(n_turns, device=flat.device).repeat_interleave(len(flat))
         shift = flat.repeat(n_turns, 1)
@@ -211,7 +211,7 @@ class PoseSearch:
         center = expected.poses[-1]
         turned = Pose.from_yaw(angles, rows.new_zeros(2)).rotation @ center.rotation
         placed = (rows @ turned.mT + center.translation) / self.cell
-        cells = torch.nn.functional.pad((placed.floor() - self._low).long(), (0, 1))
+        cells = (placed.floor() - self._low).long()
         off = expected.turned(turned)
         return _Tried(expected, angles, turned, cells, off, len(points) / len(rows) / CORRELATED)
 
@@ -234,7 +234,7 @@ class PoseSearch:
 
     def _middle(self, tried: _Tried, shift: Tensor, width: int) -> Tensor:
         """The middle (S, 2) of squares, metres."""
-        cells = shift[:, :2].double() + (width - 1) / 2
+        cells = shift.double() + (width - 1) / 2
         return tried.expected.poses[-1].translation + cells * self.cell
 
     def _told_apart(self, tried: _Tried, heading: Tensor, shift: Tensor, score: Tensor, most: int) -> Found:
@@ -292,5 +292,5 @@ def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor | None = None)
 
 def _divided(heading: Tensor, shift: Tensor, width: int) -> tuple[Tensor, Tensor]:
     """The four squares of `width` cells of each larger one."""
-    parts = torch.tensor([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]], device=shift.device) * width
+    parts = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]], device=shift.device) * width
     return heading.repeat_interleave(4), (shift[:, None] + parts).flatten(0, 1)

@@ -261,16 +261,16 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
     """Sums (C,), float64, of a raster's values at the cells of a scan under C placements.
 
     Args:
-        cells: (H, N, 3) int64, of N points under each of H headings. heading: (C,) int64, and shift: (C, 3)
-            int64, of each placement. raster: (nx, ny, nz) float32. outside: value of cells outside it.
+        cells: (H, N, 2) int64, of N points under each of H headings. heading: (C,) int64, and shift: (C, 2)
+            int64, of each placement. raster: (nx, ny) float32. outside: value of cells outside it.
     """
     if is_fused(cells, heading, shift, raster):
         return fused_bounds(cells, heading, shift, raster, outside, _NO_PRIOR)
     at = cells[heading] + shift[:, None]
     size = torch.tensor(raster.shape, device=at.device)
     is_inside = ((at >= 0) & (at < size)).all(2)
-    x, y, z = at.clamp_min(0).minimum(size - 1).unbind(2)
-    return torch.where(is_inside, raster[x, y, z].double(), outside).sum(1)
+    x, y = at.clamp_min(0).minimum(size - 1).unbind(2)
+    return torch.where(is_inside, raster[x, y].double(), outside).sum(1)
 
 
 def fused_bounds(

@@ -311,25 +311,23 @@ struct Expected {
     double never;
 };
 
-GMM_INLINE double raster_value(const int64_t* cell, const int64_t* shift, const float* raster,
-                               const int64_t (&size)[3], double outside) {
-    const uint64_t x = cell[0] + shift[0], y = cell[1] + shift[1], z = cell[2] + shift[2];
-    const bool inside = x < (uint64_t)size[0] && y < (uint64_t)size[1] && z < (uint64_t)size[2];
-    return inside ? (double)raster[(x * size[1] + y) * size[2] + z] : outside;
+GMM_INLINE double raster_value(const int64_t* cell, const int64_t* shift, const float* raster, int64_t nx,
+                               int64_t ny, double outside) {
+    const uint64_t x = cell[0] + shift[0], y = cell[1] + shift[1];
+    return x < (uint64_t)nx && y < (uint64_t)ny ? (double)raster[x * ny + y] : outside;
 }
 
 // An item is a placement of the scan: a heading and a shift in whole cells. Without an expected place the
 // bound is the sum.
 GMM_KERNEL raster_sums(int64_t item, const int64_t* cells, int64_t n_points, const int64_t* heading,
-                       const int64_t* shift, const float* raster, int64_t nx, int64_t ny, int64_t nz,
-                       double outside, Expected prior, double* bounds) {
-    const int64_t* cell = cells + heading[item] * n_points * 3;
-    const int64_t *at = shift + 3 * item, size[3] = {nx, ny, nz};
+                       const int64_t* shift, const float* raster, int64_t nx, int64_t ny, double outside,
+                       Expected prior, double* bounds) {
+    const int64_t *cell = cells + heading[item] * n_points * 2, *at = shift + 2 * item;
     double sums[4] = {0.0};  // which do not wait for each other
     int64_t n = 0;
     for (; n + 4 <= n_points; n += 4)
-        for (int i = 0; i < 4; ++i) sums[i] += raster_value(cell + 3 * (n + i), at, raster, size, outside);
-    for (; n < n_points; ++n) sums[0] += raster_value(cell + 3 * n, at, raster, size, outside);
+        for (int i = 0; i < 4; ++i) sums[i] += raster_value(cell + 2 * (n + i), at, raster, nx, ny, outside);
+    for (; n < n_points; ++n) sums[0] += raster_value(cell + 2 * n, at, raster, nx, ny, outside);
     const double sum = sums[0] + sums[1] + sums[2] + sums[3];
     bounds[item] = sum;
     if (!prior.n) return;
