@@ -241,6 +241,7 @@ def error_of_some(broken: dict[int, GmmTorchError], n: int) -> GmmTorchError:
 
 
 _FEW_POINTS, _MOST_CELLS = 1_000, 50_000  # fewer points are not pooled; more cells are not worth their time
+_WIDEST = 2.0**22  # times the noise: sums of squares of float64 still show the noise
 _TOLERANCE = 1e-4  # of EM: relative change of the log-likelihood
 
 
@@ -290,6 +291,17 @@ def fit_window(
     return Components.concatenate([returns, empty])
 
 
+def _places_apart(points: Tensor, span: float) -> Tensor | None:
+    """The place (N,) of each point, a cube of side `span` (m) from the lowest corner; None if there is one.
+
+    Wider windows lose digits, because moments are sums of squares of distances.
+    """
+    low, high = points.aminmax(dim=0)
+    if bool((high - low <= span).all()):
+        return None
+    return torch.unique(((points - low) / span).long(), dim=0, return_inverse=True)[1]
+
+
 def fit_points(
     clouds: Sequence[Tensor],
     origins: Tensor,
@@ -309,6 +321,17 @@ def fit_points(
     if n_points == 0:
         return Components.empty(dim, origins.device)
     points = torch.cat(list(clouds)).double()
+    if (places := _places_apart(points, _WIDEST * fit.noise)) is not None:
+        split = [places == n for n in range(int(places.max()) + 1)]
+        parts = []
+        for chosen in split:
+            rows = [part.nonzero().squeeze(1) for part in chosen.split(sizes)]
+            some = [cloud[each] for cloud, each in zip(clouds, rows, strict=True)]
+            channels = [
+                {k: v[each] for k, v in of.items()} for of, each in zip(attributes, rows, strict=False)
+            ]
+            parts.append(fit_points(some, origins, fit, viewpoints, channels, max_range=max_range))
+        return Components.concatenate(parts).with_used_origins()
     ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)
@@ -334,9 +357,10 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
 
     The images are summed into cells at once, without a list of their points. Components are not numbered.
     """
-    origins = torch.stack([frame.pose.translation for frame in frames])
-    origins = origins.to(frames[0].depth.device, non_blocking=True)
-    if fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
+    placed = torch.stack([frame.pose.translation for frame in frames])
+    origins = placed.to(frames[0].depth.device, non_blocking=True)
+    is_wide = float((placed.amax(0) - placed.amin(0)).max()) > _WIDEST * fit.noise
+    if is_wide or fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
     cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)
     if cells.weight.shape[0] == 0:
