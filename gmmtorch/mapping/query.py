@@ -244,7 +244,9 @@ class Query:
         self._blocks: list[Block] = _replaced(former._blocks if former else [], every)
         some = [part for part in recent if len(part.seen_by)]
         known = former._recent if former and some else []
-        self._recent = [block.replaced(*some) for block in known] or ([Block(*some)] if some else [])
+        self._recent: list[Block] = [block.replaced(*some) for block in known] or (
+            [Block(*some)] if some else []
+        )
         self.rule = rule_of(options, [*parts, *recent])
         self.cutoff = options.cutoff or cutoff_for([*self._blocks, *self._recent])
         self._lattices: dict[float, SparseEvidence] = {}

@@ -220,19 +220,49 @@ def near_lists(
     lengths = given.lengths()[lists]
     if is_fused(table, given.entries, lists, centers):
         ends = lengths.cumsum(0)
-        firsts, counts = ends - lengths, torch.zeros_like(lengths, dtype=torch.float64)
-        near = torch.empty(int(ends[-1]) if len(ends) else 0, dtype=torch.bool, device=table.device)
-        lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
-        arguments = (table, *given, lists, firsts, centers, radii, len(lists))
-        sizes = (cube_reach, spread, table.shape[1], cutoff, parts)
-        n_items = (len(lists) + lanes - 1) // lanes * parts
-        _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts)
-        counts = counts.long()
+        firsts, n_entries = ends - lengths, int(ends[-1]) if len(ends) else 0
+        balls = lists, firsts, centers, radii
+        near, counts = _near_flags(table, given, *balls, n_entries, cube_reach, spread, cutoff)
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])
     ball, cone = given.taken(lists)
     near = _near_cone(table.T, cone, centers[ball], radii[ball], cube_reach, spread, cutoff)
     return Lists.of(torch.bincount(ball[near], minlength=len(lists)), cone[near].int())
+
+
+def near_cones(
+    table: Tensor, centers: Tensor, radii: Tensor, cube_reach: float, spread: float, cutoff: float
+) -> Lists:
+    """`near_lists` of all cones, at least one, by the fused kernel; takes fewer operations."""
+    n, n_balls, device = len(table), len(centers), table.device
+    given = Lists(torch.arange(0, n + 1, n, device=device), torch.arange(n, dtype=torch.int32, device=device))
+    firsts = torch.arange(0, n * n_balls, n, device=device)
+    balls = torch.zeros_like(firsts), firsts, centers, radii
+    near, counts = _near_flags(table, given, *balls, n * n_balls, cube_reach, spread, cutoff)
+    return Lists.of(counts, near.view(n_balls, n).nonzero()[:, 1].int())
+
+
+def _near_flags(
+    table: Tensor,
+    given: Lists,
+    lists: Tensor,
+    firsts: Tensor,
+    centers: Tensor,
+    radii: Tensor,
+    n_entries: int,
+    cube_reach: float,
+    spread: float,
+    cutoff: float,
+) -> tuple[Tensor, Tensor]:
+    """Which entries are near, those of each ball from `firsts` (T,) on; and how many each ball has."""
+    near = torch.empty(n_entries, dtype=torch.bool, device=table.device)
+    counts = torch.zeros_like(radii)
+    lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
+    arguments = (table, *given, lists, firsts, centers, radii, len(lists))
+    sizes = (cube_reach, spread, table.shape[1], cutoff, parts)
+    n_items = (len(lists) + lanes - 1) // lanes * parts
+    _NEAR[centers.shape[1]](n_items, *arguments, *sizes, near, counts)
+    return near, counts.long()
 
 
 def _near_cone(

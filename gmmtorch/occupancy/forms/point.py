@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.kernels import Lists, PointTable, chunked, is_fused, listed_evidence, pair_evidence
+from gmmtorch.kernels import PointTable, chunked, is_fused, listed_evidence, near_cones, pair_evidence
 from gmmtorch.linalg import order_along_curve, safe_cholesky
 from gmmtorch.occupancy.cone_index import ConeIndex, Hulls, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
@@ -242,8 +242,7 @@ class PointForm:
         """
         given = points if isinstance(points, PointGroups) else PointGroups(check_queries(points, self.dim))
         query = given.points
-        zeros = torch.zeros_like(query[:, 0])
-        before = before or PointEvidence(zeros, zeros)
+        before = before or PointEvidence(*torch.zeros(2, len(query), dtype=query.dtype, device=query.device))
         if given.are_few and is_fused(query, self.rows):
             return PointEvidence(*self._added(given, torch.stack([*before])))
 
@@ -275,11 +274,9 @@ class PointForm:
             for rows, number in self.index.parts(every):
                 listed_evidence(every, rows, number, self.index.lists, *settings)
         elif len(self.rows) and len(points.order):
-            n = len(self.rows)
-            bounds, cones = (torch.arange(0, n + 1, step, device=every.device) for step in (n, 1))
             hulls = Hulls(self.rows, self.resolution, self.cutoff, smoothed=True)
-            balls = torch.zeros_like(points.radii, dtype=torch.int64), points.centers, points.radii
-            lists = hulls.near(Lists(bounds, cones[:-1].int()), *balls)
+            sizes = hulls.reach, hulls.spread, hulls.cutoff
+            lists = near_cones(self.rows, points.centers, points.radii, *sizes)
             listed_evidence(every, points.order, points.bucket, lists, *settings)
         return found
 
