@@ -277,7 +277,8 @@ class Query:
                 self._boxes[side] = boxes_of(blocks, side, self.cutoff)
             low, high = self._boxes[side]
             if points.are_few:
-                met = ((points.low[:, None] <= high) & (points.high[:, None] >= low)).all(2).any(0)
+                first, last = (corner[:, None] for corner in points.box)
+                met = ((first <= high) & (last >= low)).all(2).any(0)
                 yield from ((blocks[number], None) for number in met.nonzero().squeeze(1).tolist())
             else:
                 yield from _with_rows(blocks, points.points.detach().to(low), low, high)

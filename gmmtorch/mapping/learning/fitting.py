@@ -322,15 +322,12 @@ def fit_points(
         return Components.empty(dim, origins.device)
     points = torch.cat(list(clouds)).double()
     if (places := _places_apart(points, _WIDEST * fit.noise)) is not None:
-        split = [places == n for n in range(int(places.max()) + 1)]
         parts = []
-        for chosen in split:
-            rows = [part.nonzero().squeeze(1) for part in chosen.split(sizes)]
-            some = [cloud[each] for cloud, each in zip(clouds, rows, strict=True)]
-            channels = [
-                {k: v[each] for k, v in of.items()} for of, each in zip(attributes, rows, strict=False)
-            ]
-            parts.append(fit_points(some, origins, fit, viewpoints, channels, max_range=max_range))
+        for number in range(int(places.max()) + 1):
+            kept = [place == number for place in places.split(sizes)]
+            some = [cloud[rows] for cloud, rows in zip(clouds, kept, strict=True)]
+            own = [{k: v[rows] for k, v in a.items()} for a, rows in zip(attributes, kept, strict=False)]
+            parts.append(fit_points(some, origins, fit, viewpoints, own, max_range=max_range))
         return Components.concatenate(parts).with_used_origins()
     ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)

@@ -75,7 +75,7 @@ class PointGroups:
     """Points (M, D), float64. Few need no index: cones are found for groups of `_GROUP` neighbours.
 
     order (R,): the points that are not too far away, group by group. bucket (M,): the group of each point.
-    centers (G, D), radii (G,): a ball around the points of each group. low, high (G, D): a box around them.
+    box: low, high (G, D) of each group. ball: centers (G, D) and radii (G,), around the points of each group.
     """
 
     def __init__(self, points: Tensor) -> None:
@@ -99,20 +99,13 @@ class PointGroups:
         return self.points.detach()[order].view(-1, _GROUP, self.points.shape[1])
 
     @functools.cached_property
-    def low(self) -> Tensor:
-        return self._grouped.amin(1)
+    def box(self) -> tuple[Tensor, Tensor]:
+        return self._grouped.amin(1), self._grouped.amax(1)
 
     @functools.cached_property
-    def high(self) -> Tensor:
-        return self._grouped.amax(1)
-
-    @functools.cached_property
-    def centers(self) -> Tensor:
-        return 0.5 * (self.low + self.high)
-
-    @functools.cached_property
-    def radii(self) -> Tensor:
-        return (self._grouped - self.centers[:, None]).norm(dim=2).amax(1)
+    def ball(self) -> tuple[Tensor, Tensor]:
+        centers = 0.5 * (self.box[0] + self.box[1])
+        return centers, (self._grouped - centers[:, None]).norm(dim=2).amax(1)
 
 
 class PointEvidence(NamedTuple):
@@ -275,8 +268,7 @@ class PointForm:
                 listed_evidence(every, rows, number, self.index.lists, *settings)
         elif len(self.rows) and len(points.order):
             hulls = Hulls(self.rows, self.resolution, self.cutoff, smoothed=True)
-            sizes = hulls.reach, hulls.spread, hulls.cutoff
-            lists = near_cones(self.rows, points.centers, points.radii, *sizes)
+            lists = near_cones(self.rows, *points.ball, hulls.reach, hulls.spread, hulls.cutoff)
             listed_evidence(every, points.order, points.bucket, lists, *settings)
         return found
 
