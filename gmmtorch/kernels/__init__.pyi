@@ -18,6 +18,7 @@ from .evidence.point_evidence import Lists as Lists
 from .evidence.point_evidence import PointTable as PointTable
 from .evidence.point_evidence import few_points_evidence as few_points_evidence
 from .evidence.point_evidence import listed_evidence as listed_evidence
+from .evidence.point_evidence import near_cones as near_cones
 from .evidence.point_evidence import near_lists as near_lists
 from .evidence.point_evidence import pair_evidence as pair_evidence
 from .mixtures.cell_sums import KEY_BITS as KEY_BITS

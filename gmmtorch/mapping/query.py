@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,6 +21,7 @@ from gmmtorch.occupancy import (
     Evidence,
     PointEvidence,
     PointForm,
+    PointGroups,
     Rule,
     SparseEvidence,
     VoxelGrid,
@@ -88,24 +88,28 @@ def evidence_boxes(
     return low - pad, high + pad
 
 
-_BLOCK = 8192  # components
+_BLOCK = 2048  # components
 
 
 class Block:
     """Components that answer together, with the forms and indices of their cones for each resolution that was
     asked for, and what is known about all of them. Everything is made when it is needed."""
 
-    def __init__(self, components: Components) -> None:
-        self.components = components
+    def __init__(self, *parts: Components) -> None:
+        self._parts = parts
         self.forms: dict[float, PointForm] = {}
         self._indices: dict[float, ConeIndex] = {}
         self._boxes: dict[float, tuple[Tensor, Tensor, Tensor]] = {}  # for each cutoff
         self._cutoff = 0.0  # of forms and indices
 
     @functools.cached_property
+    def components(self) -> Components:
+        return Components.concatenate(self._parts)
+
+    @functools.cached_property
     def counts(self) -> tuple[int, int]:
         """`count_many` of the components."""
-        return count_many(self.components.seen_count)
+        return count_many(torch.cat([part.seen_count for part in self._parts]))
 
     def box(self, cutoff: float) -> tuple[Tensor, Tensor, Tensor]:
         """low, high (D,), distance (): the first arguments of `evidence_boxes`. There must be a viewpoint.
@@ -138,17 +142,23 @@ class Block:
         if cutoff != self._cutoff:
             self._cutoff, self.forms, self._indices = cutoff, {}, {}
 
-    def replaced(self, components: Components) -> Block:
+    def replaced(self, *parts: Components) -> Block:
         """The block of other components, which keeps the lists that it can."""
-        if components is self.components:
+        n_known, made = len(self._parts), Block(*parts)
+        is_extended = all(a is b for a, b in zip(self._parts, parts, strict=False))
+        if is_extended and len(parts) == n_known:
             return self
-        if _same(self.components, components):
-            made = copy.copy(self)
-            made.components = components  # else this would keep all earlier components in memory
-            return made
-        made, cones = Block(components), components.cones()
         made._cutoff = self._cutoff
-        former = former_rows(self.components.cones(), cones)
+        if is_extended and len(parts) > n_known and not self._indices:
+            new = Block(*parts[n_known:])
+            made.forms = {
+                side: form.extended(new.form(side, self._cutoff, 1.0)) for side, form in self.forms.items()
+            }
+            return made
+        if _same(self.components, made.components):
+            made.forms, made._indices, made._boxes = self.forms, self._indices, self._boxes
+            return made
+        former, cones = former_rows(self.components.cones(), made.components.cones()), made.components.cones()
         if 2 * int((former < 0).sum()) <= len(former):
             made.forms = {side: form.replaced(cones, former) for side, form in self.forms.items()}
             made._indices = {side: index.replaced(cones, former) for side, index in self._indices.items()}
@@ -184,6 +194,23 @@ def cutoff_for(blocks: Iterable[Block]) -> float:
     return cutoff_of(*map(sum, zip((0, 0), *(block.counts for block in blocks), strict=True)))
 
 
+def _with_rows(
+    blocks: Sequence[Block], points: Tensor, low: Tensor, high: Tensor
+) -> Iterator[tuple[Block, Tensor | None]]:
+    """The blocks with boxes low, high (B, D) that contain some of the points (M, D), and the points (R,)."""
+    finite = torch.where(torch.isfinite(points), points, torch.nan)
+    ends = [torch.nan_to_num(finite, nan=far) for far in (torch.inf, -torch.inf)]
+    met = (ends[0].amin(0) <= high).all(1) & (ends[1].amax(0) >= low).all(1)
+    columns = points.T.contiguous()
+    for number in met.nonzero().squeeze(1).tolist():
+        inside = torch.ones_like(columns[0], dtype=torch.bool)
+        for column, first, last in zip(columns, low[number], high[number], strict=True):
+            inside &= (column >= first) & (column <= last)
+        rows = inside.nonzero().squeeze(1)
+        if len(rows):
+            yield blocks[number], rows
+
+
 def boxes_of(blocks: Sequence[Block], side: float, cutoff: float) -> tuple[Tensor, Tensor]:
     """`evidence_boxes` of at least one block."""
     low, high, distance = map(torch.stack, zip(*(block.box(cutoff) for block in blocks), strict=True))
@@ -216,12 +243,16 @@ class Query:
         every = [one for part in parts for one in (in_blocks(part) if len(part) > 2 * _BLOCK else [part])]
         self._blocks: list[Block] = _replaced(former._blocks if former else [], every)
         some = [part for part in recent if len(part.seen_by)]
-        joined = [Components.concatenate(some)] if some else []
-        self._recent: list[Block] = _replaced(former._recent if former else [], joined)
+        known = former._recent if former and some else []
+        self._recent: list[Block] = [block.replaced(*some) for block in known] or (
+            [Block(*some)] if some else []
+        )
         self.rule = rule_of(options, [*parts, *recent])
         self.cutoff = options.cutoff or cutoff_for([*self._blocks, *self._recent])
         self._lattices: dict[float, SparseEvidence] = {}
-        self._boxes: dict[float, tuple[Tensor, Tensor]] = {}  # for each side
+        self._boxes: dict[float, tuple[Tensor, Tensor]] = {}  # of the blocks but the recent, for each side
+        if former and self.cutoff == former.cutoff and self._blocks == former._blocks:
+            self._boxes = former._boxes
 
     def prepare(self, former: Query) -> None:
         """Makes what the first query at the resolutions that `former` was asked for would make."""
@@ -236,29 +267,22 @@ class Query:
         every = [block.components.cones() for block in [*self._blocks, *self._recent]]
         return Cones(*map(torch.cat, zip(*every, strict=True))) if every else self.parts[0].cones()
 
-    def _near(self, points: Tensor, side: float) -> Iterator[tuple[Block, Tensor | None]]:
-        """The blocks that can give evidence at points (M, D), and the points (R,) of each; None: all."""
-        blocks = [*self._blocks, *self._recent]
+    def _near(self, points: PointGroups, side: float) -> Iterator[tuple[Block, Tensor | None]]:
+        """The blocks that can give evidence at M points, and the points (R,) of each; None: all."""
+        blocks = self._blocks
         if len(blocks) <= 1:
             yield from ((block, None) for block in blocks)
-            return
-        if side not in self._boxes:
-            self._boxes[side] = boxes_of(blocks, side, self.cutoff)
-        low, high = self._boxes[side]
-        fixed = points.detach().to(low)
-        finite = torch.where(torch.isfinite(fixed), fixed, torch.nan)
-        if not len(points):
-            return
-        ends = [torch.nan_to_num(finite, nan=far) for far in (torch.inf, -torch.inf)]
-        met = (ends[0].amin(0) <= high).all(1) & (ends[1].amax(0) >= low).all(1)
-        columns = fixed.T.contiguous()
-        for number in met.nonzero().squeeze(1).tolist():
-            inside = torch.ones_like(columns[0], dtype=torch.bool)
-            for column, first, last in zip(columns, low[number], high[number], strict=True):
-                inside &= (column >= first) & (column <= last)
-            rows = inside.nonzero().squeeze(1)
-            if len(rows):
-                yield blocks[number], rows
+        elif len(points.order if points.are_few else points.points):
+            if side not in self._boxes:
+                self._boxes[side] = boxes_of(blocks, side, self.cutoff)
+            low, high = self._boxes[side]
+            if points.are_few:
+                first, last = (corner[:, None] for corner in points.box)
+                met = ((first <= high) & (last >= low)).all(2).any(0)
+                yield from ((blocks[number], None) for number in met.nonzero().squeeze(1).tolist())
+            else:
+                yield from _with_rows(blocks, points.points.detach().to(low), low, high)
+        yield from ((block, None) for block in self._recent)
 
     def occupancy(self, points: Tensor, resolution: float, method: str) -> Tensor:
         """Probability (M,) that the cube of side `resolution` (m) of each point (M, D) is occupied.
@@ -314,10 +338,11 @@ class Query:
     def _at_points(self, points: Tensor, resolution: float) -> PointEvidence:
         """Evidence of the point form. The sum over all cones has one order, in whichever blocks they are."""
         found = PointEvidence(*torch.zeros(2, len(points), dtype=points.dtype, device=points.device))
-        for block, rows in self._near(points, resolution):
+        every = PointGroups(points)
+        for block, rows in self._near(every, resolution):
             form = block.form(resolution, self.cutoff, 1 / max(1, len(self._blocks)))
             if rows is None:
-                found = form(points, found)
+                found = form(every, found)
             else:
                 part = form(points[rows], PointEvidence(*(values[rows] for values in found)))
                 found = PointEvidence(
@@ -330,7 +355,7 @@ class Query:
         of `cells` (M, D)."""
         hits, misses = torch.zeros(2, len(low), dtype=low.dtype, device=low.device)
         every = torch.arange(len(low), device=low.device)
-        for block, chosen in self._near(0.5 * (low + high), side):
+        for block, chosen in self._near(PointGroups(0.5 * (low + high)), side):
             rows, cones = every if chosen is None else chosen, block.components.cones()
             boxes = low[rows], high[rows]
             pairs = block.index(side, self.cutoff).candidates(*boxes)

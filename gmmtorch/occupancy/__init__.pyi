@@ -36,6 +36,7 @@ from .forms.point import ExpectedRange as ExpectedRange
 from .forms.point import KeptEvidence as KeptEvidence
 from .forms.point import PointEvidence as PointEvidence
 from .forms.point import PointForm as PointForm
+from .forms.point import PointGroups as PointGroups
 from .forms.point import RayHits as RayHits
 from .forms.point import expected_range as expected_range
 from .forms.point import few_point_evidence as few_point_evidence

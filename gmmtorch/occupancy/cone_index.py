@@ -99,15 +99,13 @@ class Hulls:
     def near(self, given: Lists, lists: Tensor, centers: Tensor, radii: Tensor) -> Lists:
         """For each ball (T,), those cones of its list that can give evidence to a cube centred in the ball;
         arguments as for `near_lists`."""
-        chunks = chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
+        sizes = self.reach, self.spread, self.cutoff
+        if len(lists) * len(self.table) <= _TESTS_AT_ONCE:
+            return near_lists(self.table, given, lists, centers, radii, *sizes)
         parts = [
-            near_lists(
-                self.table, given, lists[t], centers[t], radii[t], self.reach, self.spread, self.cutoff
-            )
-            for t in chunks
+            near_lists(self.table, given, lists[t], centers[t], radii[t], *sizes)
+            for t in chunks_of(given.lengths()[lists], _TESTS_AT_ONCE)
         ]
-        if len(parts) == 1:
-            return parts[0]
         lengths = [part.lengths() for part in parts] or [lists]
         return Lists.of(torch.cat(lengths), torch.cat([given.entries[:0], *(part.entries for part in parts)]))
 

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+from unittest.mock import patch
+
 import torch
 from torch import Tensor
 
+from gmmtorch.kernels.rays import component_casting
 from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
+from gmmtorch.team.exploration.robot import component_rays
 from gmmtorch.team.exploration.robot.component_rays import RayRule, component_evidence
 
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
 
 
-def evidence_of(components: Components, resolution: float, box: Box, **options) -> CellEvidence:
-    return component_evidence(components, box, RayRule(resolution, **options))
+def evidence_of(
+    components: Components, resolution: float, box: Box, thinned: bool = False, **options
+) -> CellEvidence:
+    """`thinned`: as robots count; otherwise all rays are followed all of their way."""
+    with ExitStack() as stack:
+        for module in (component_rays, component_casting) if not thinned else ():
+            stack.enter_context(patch.object(module, "THINNING", 1))
+        return component_evidence(components, box, RayRule(resolution, **options))
 
 
 def one(covariance, mean=(4.0, 1.0, 0.5), origin=(0.1, 0.2, 0.3), count=100.0, sequence=0) -> Components:

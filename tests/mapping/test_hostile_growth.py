@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gmmtorch.mapping import query as map_query
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule
+from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.tiles import tiled_map
 from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.occupancy import point_evidence
@@ -94,6 +94,25 @@ def test_a_robot_that_jumps_a_million_metres_is_answered_at_both_places(monkeypa
             float((alone.occupancy(asked) > 0.5).double().mean()), abs=0.05
         )
     assert (made.occupancy(asked + 0.5 * shift) == 0.5).all()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("rule", [FINE, IncrementalRule(), WindowedRule()])
+def test_one_window_of_two_places_a_million_metres_apart_is_learned_at_both(rule, dim):
+    first, second = open_drive(6, dim)[::2], open_drive(6, dim)[1::2]
+    shift = [1e6, -1e7, 3e5][:dim]
+    far = [scan.transformed(shifted(dim, shift)) for scan in second]
+    rule = replace(rule, window=6)
+    made = built([scan for pair in zip(first, far, strict=True) for scan in pair], rule)
+    assert made.n_pending == 0
+    for scans, place in ((first, [0.0] * dim), (second, shift)):
+        asked = torch.cat([scan.points[::5] for scan in scans]) + 0.01
+        alone = built(scans, rule).occupancy(asked)
+        theta = made.occupancy(asked + asked.new_tensor(place))
+        torch.testing.assert_close(theta, alone, rtol=0, atol=0.1)
+        assert float((theta > 0.5).double().mean()) == pytest.approx(
+            float((alone > 0.5).double().mean()), abs=0.02
+        )
 
 
 def test_places_outside_all_tiles_are_unknown_and_open_none(tmp_path, monkeypatch):

@@ -53,12 +53,14 @@ GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, c
             vec widened = whole * closeness;
             widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
             const vec far = whole + longest + widened, beta = far * reach * closeness;
-            // All of the ellipsoid lies within its longest half axis of the mean: a quick test.
+            // All of the ellipsoid lies within its longest half axis of the mean, which must be near the ray
+            // beyond x: a quick test.
             vec along = (vec)(0.0);
             for (int j = 0; j < DIM; ++j) along += (mean[j] - origin[j]) * ray[j];
             const vec within = longest + widened + beta, square = distance * distance;
             mask close = distance <= far + reach;
-            close &= (mm * (1.0 - 1e-14) - within * within) * square <= along * along;
+            const vec over = square * (1.0 - 1e-14) > along ? square - along : (vec)(0.0);
+            close &= (mm * (1.0 - 1e-14) - within * within) * square + over * over <= along * along;
             widened *= widened;
             if (any(active & close)) {
                 for (int j = 0; j < DIM; ++j) {

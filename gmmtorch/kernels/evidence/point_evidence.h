@@ -39,9 +39,11 @@ GMM_INLINE void add_evidence(const double* cone, const vec* x, double h, double 
         turn += toward * ray[j];
         seen_squared += toward * toward;
     }
-    // The mean is farther from the ray than the cutoff for the largest variance: a quick test.
+    // The mean is farther than the cutoff for the largest variance from the ray beyond x: a quick test.
     const double widest = seen_squared * (1.0 - 1e-14) - limit * (variance[DIM - 1] + h * h / 12.0);
-    const mask near = widest * squared_distance - turn * turn <= maximum(limit, 9.0) * rest[0];
+    const vec over = squared_distance * (1.0 - 1e-14) > turn ? squared_distance - turn : (vec)(0.0);
+    mask near = widest * squared_distance - turn * turn + over * over <= limit * rest[0];
+    near |= squared_distance <= 0.26 * DIM * h * h;  // the cube may contain the sensor origin
     if (!any(active & near)) return;
     for (int j = 0; j < DIM; ++j) {
         y[j] = (vec)(0.0);

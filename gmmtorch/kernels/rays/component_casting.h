@@ -137,7 +137,7 @@ GMM_KERNEL cast_components(int64_t item, const double* means, const double* cova
     int64_t size[3];
     for (int a = 0; a < 3; ++a) size[a] = (int64_t)(bounds[9 + a] - lows[a]);
     const int64_t stride[3] = {size[1] * size[2], size[2], 1};
-    const int64_t n_draws = n_rays * times, n_some = thinning ? (n_rays + thinning - 1) / thinning : 0;
+    const int64_t n_draws = n_rays * times, n_some = (n_rays + thinning - 1) / thinning;
     const double per_draw = seen_count[row] / (double)n_draws, per_ray = per_draw * (double)times;
     const double per_first_half = n_some ? per_ray * ((double)n_rays / (double)n_some) : 0.0;
     for (int64_t draw = part; draw < n_draws; draw += parts) {
@@ -177,7 +177,7 @@ GMM_KERNEL cast_components(int64_t item, const double* means, const double* cova
             cells[6 + a] = stop / resolution;
         }
         for (int half = 0; half < (draw < n_some ? 2 : 1); ++half) {
-            const double* starts = cells + (thinning ? 3 - 3 * half : 0);
+            const double* starts = cells + 3 - 3 * half;
             const double* ends = cells + 6 - 3 * half;
             const Rays ray = {
                 starts, ends, lows, 3, {size[0], size[1], size[2]}, {stride[0], stride[1], stride[2]},

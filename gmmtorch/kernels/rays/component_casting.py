@@ -43,7 +43,6 @@ def cast_components(
     cutoff: tuple[float, float],
     shell: float,
     hits_per_ray: int,
-    thinned: bool,
 ) -> tuple[Tensor, Tensor] | None:
     """Hits and misses (nx, ny, nz) float64 of a window of cells; None if a covariance has no factor.
 
@@ -67,7 +66,7 @@ def cast_components(
     table = _shrinkages(cutoff, str(device)), _RADII + 2, _RADII / _FARTHEST_DRAW
     per_cell, ends = (means.new_tensor(pair) for pair in (rays_per_cell, cutoff))
     given = means, covariances, origins, max_range, ids, *seen, points, points.shape[1], *table, bounds
-    rule = per_cell, least, most, ends, EFFECTIVE_AREA, shell, hits_per_ray, THINNING if thinned else 0
+    rule = per_cell, least, most, ends, EFFECTIVE_AREA, shell, hits_per_ray, THINNING
     _CAST(len(seen[0]) * parts, *given, parts, resolution, TIE, *rule, hits, misses, failed)
     return None if bool(failed) else (hits, misses)
 

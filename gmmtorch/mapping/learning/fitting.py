@@ -241,6 +241,7 @@ def error_of_some(broken: dict[int, GmmTorchError], n: int) -> GmmTorchError:
 
 
 _FEW_POINTS, _MOST_CELLS = 1_000, 50_000  # fewer points are not pooled; more cells are not worth their time
+_WIDEST = 2.0**22  # times the noise: sums of squares of float64 still show the noise
 _TOLERANCE = 1e-4  # of EM: relative change of the log-likelihood
 
 
@@ -290,6 +291,17 @@ def fit_window(
     return Components.concatenate([returns, empty])
 
 
+def _places_apart(points: Tensor, span: float) -> Tensor | None:
+    """The place (N,) of each point, a cube of side `span` (m) from the lowest corner; None if there is one.
+
+    Wider windows lose digits, because moments are sums of squares of distances.
+    """
+    low, high = points.aminmax(dim=0)
+    if bool((high - low <= span).all()):
+        return None
+    return torch.unique(((points - low) / span).long(), dim=0, return_inverse=True)[1]
+
+
 def fit_points(
     clouds: Sequence[Tensor],
     origins: Tensor,
@@ -309,6 +321,14 @@ def fit_points(
     if n_points == 0:
         return Components.empty(dim)
     points = torch.cat(list(clouds)).double()
+    if (places := _places_apart(points, _WIDEST * fit.noise)) is not None:
+        parts = []
+        for number in range(int(places.max()) + 1):
+            kept = [place == number for place in places.split(sizes)]
+            some = [cloud[rows] for cloud, rows in zip(clouds, kept, strict=True)]
+            own = [{k: v[rows] for k, v in a.items()} for a, rows in zip(attributes, kept, strict=False)]
+            parts.append(fit_points(some, origins, fit, viewpoints, own, max_range=max_range))
+        return Components.concatenate(parts).with_used_origins()
     ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)
@@ -337,7 +357,9 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     The images are summed into cells at once, without a list of their points. Components are not numbered,
     and on the CPU.
     """
-    if fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
+    origins = torch.stack([frame.pose.translation for frame in frames])
+    is_wide = float((origins.amax(0) - origins.amin(0)).max()) > _WIDEST * fit.noise
+    if is_wide or fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
     cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)
     if cells.weight.shape[0] == 0:
@@ -346,7 +368,7 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     owner = most_likely_component(cells.features, found)
     counts = cells.counts.new_zeros(found.weights.shape[0], len(frames)).index_add_(0, owner, cells.counts)
     counts, *parts = on_cpu(counts, found.weights, found.means + cells.center, found.covariances)
-    found, origins = Parameters(*parts), torch.stack([frame.pose.translation for frame in frames])
+    found = Parameters(*parts)
     assigned = viewpoints(counts, found.weights, int(counts.numpy().sum()))
     return _components(found, assigned, origins, max_range=False)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.kernels import Lists, PointTable, chunked, is_fused, listed_evidence, pair_evidence
+from gmmtorch.kernels import PointTable, chunked, is_fused, listed_evidence, near_cones, pair_evidence
 from gmmtorch.linalg import order_along_curve, safe_cholesky
 from gmmtorch.occupancy.cone_index import ConeIndex, Hulls, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
@@ -67,7 +67,45 @@ CHUNK_PAIRS = 1 << 16
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
 _FARTHEST = 1e15  # metres: products of larger positions are infinite
 _GROUP = 64  # points whose cones are found together
+_FEW_POINTS = 1 << 11
 _FEW_PAIRS = 1 << 23  # of a point and a cone: for at most so many an index does not pay
+
+
+class PointGroups:
+    """Points (M, D), float64. Few need no index: cones are found for groups of `_GROUP` neighbours.
+
+    order (R,): the points that are not too far away, group by group. bucket (M,): the group of each point.
+    box: low, high (G, D) of each group. ball: centers (G, D) and radii (G,), around the points of each group.
+    """
+
+    def __init__(self, points: Tensor) -> None:
+        self.points, self.are_few = points, len(points) <= _FEW_POINTS
+
+    @functools.cached_property
+    def order(self) -> Tensor:
+        order = (self.points.abs() <= _FARTHEST).all(1).nonzero().squeeze(1)
+        return order[order_along_curve(self.points[order])] if len(order) else order
+
+    @functools.cached_property
+    def bucket(self) -> Tensor:
+        group = torch.arange(len(self.order), device=self.order.device) // _GROUP
+        return torch.zeros_like(self.points[:, 0], dtype=torch.int64).index_copy_(0, self.order, group)
+
+    @functools.cached_property
+    def _grouped(self) -> Tensor:
+        """(G, `_GROUP`, D), the last group with repetitions."""
+        missing = -len(self.order) % _GROUP
+        order = torch.cat([self.order, self.order[-1:].expand(missing)]) if missing else self.order
+        return self.points.detach()[order].view(-1, _GROUP, self.points.shape[1])
+
+    @functools.cached_property
+    def box(self) -> tuple[Tensor, Tensor]:
+        return self._grouped.amin(1), self._grouped.amax(1)
+
+    @functools.cached_property
+    def ball(self) -> tuple[Tensor, Tensor]:
+        centers = 0.5 * (self.box[0] + self.box[1])
+        return centers, (self._grouped - centers[:, None]).norm(dim=2).amax(1)
 
 
 class PointEvidence(NamedTuple):
@@ -178,15 +216,28 @@ class PointForm:
             made._index = made._new_index
         return made
 
-    def __call__(self, points: ArrayLike, before: PointEvidence | None = None) -> PointEvidence:
+    def extended(self, other: PointForm) -> PointForm:
+        """The form of these cones and, after them, those of another one, for cubes of the same side."""
+        made, n = copy.copy(self), len(self.rows)
+        made._table = PointTable(*map(torch.cat, zip(self._table, other._table, strict=True)))
+        made._index = made._new_index
+        if isinstance(self._index, ConeIndex):
+            number = torch.arange(len(made.rows), device=made.rows.device)
+            former = torch.where(number < n, number, -1)
+            made._index = functools.partial(self._index.replaced, made.rows, former)
+        return made
+
+    def __call__(self, points: ArrayLike | PointGroups, before: PointEvidence | None = None) -> PointEvidence:
         """Hits and misses at points (M, D), world metres; zero at infinite points. `before`: of other cones,
         to which these are added.
 
         Raises `InvalidArgumentError` for another shape, or NaN.
         """
-        query = check_queries(points, self.dim)
-        zeros = torch.zeros_like(query[:, 0])
-        before = before or PointEvidence(zeros, zeros)
+        given = points if isinstance(points, PointGroups) else PointGroups(check_queries(points, self.dim))
+        query = given.points
+        before = before or PointEvidence(*torch.zeros(2, len(query), dtype=query.dtype, device=query.device))
+        if given.are_few and is_fused(query, self.rows):
+            return PointEvidence(*self._added(given, torch.stack([*before])))
 
         def evaluated(part: slice) -> PointEvidence:
             return self._evaluate(query[part], before.hits[part], before.misses[part])
@@ -197,7 +248,7 @@ class PointForm:
 
     def _evaluate(self, points: Tensor, hits: Tensor, misses: Tensor) -> PointEvidence:
         if is_fused(points, self.rows):
-            return PointEvidence(*self._fused(points, torch.stack([hits, misses])))
+            return PointEvidence(*self._added(PointGroups(points), torch.stack([hits, misses])))
         for rows, number in self.index.parts(points):
             if not len(rows):
                 continue
@@ -208,33 +259,18 @@ class PointForm:
             hits, misses = hits.index_add(0, rows, hit), misses.index_add(0, rows, miss)
         return PointEvidence(hits, misses)
 
-    def _fused(self, points: Tensor, found: Tensor) -> Tensor:
-        """Adds hits and misses to `found` (2, M) by the fused kernel."""
+    def _added(self, points: PointGroups, found: Tensor) -> Tensor:
+        """`found` (2, M), to which hits and misses at M points are added by the fused kernel."""
+        every = points.points
         settings = self.rows, self.resolution, self.cutoff, found
-        if len(points) * len(self.rows) <= _FEW_PAIRS:
-            order = (points.abs() <= _FARTHEST).all(1).nonzero().squeeze(1)
-            if len(order):
-                order = order[order_along_curve(points[order])]
-                bucket, lists = self._listed(points, order)
-                listed_evidence(points, order, bucket, lists, *settings)
-            return found
-        for rows, number in self.index.parts(points):
-            listed_evidence(points, rows, number, self.index.lists, *settings)
+        if len(every) * len(self.rows) > _FEW_PAIRS:
+            for rows, number in self.index.parts(every):
+                listed_evidence(every, rows, number, self.index.lists, *settings)
+        elif len(self.rows) and len(points.order):
+            hulls = Hulls(self.rows, self.resolution, self.cutoff, smoothed=True)
+            lists = near_cones(self.rows, *points.ball, hulls.reach, hulls.spread, hulls.cutoff)
+            listed_evidence(every, points.order, points.bucket, lists, *settings)
         return found
-
-    def _listed(self, points: Tensor, order: Tensor) -> tuple[Tensor, Lists]:
-        """Lists of the cones near groups of `_GROUP` points that follow each other in `order`, and the list
-        of each of the points (M, D). Takes less time than an index where there are few points."""
-        place = torch.arange(len(order) + -len(order) % _GROUP, device=order.device)
-        group = place[: len(order)] // _GROUP
-        bucket = torch.zeros_like(points[:, 0], dtype=torch.int64).index_copy_(0, order, group)
-        some = points[order[place.clamp_max(len(order) - 1)]].view(-1, _GROUP, self.dim)
-        centers = 0.5 * (some.amin(1) + some.amax(1))
-        radii = (some - centers[:, None]).norm(dim=2).amax(1)
-        every = torch.arange(len(self.rows), dtype=torch.int32, device=points.device)
-        given = Lists.of(order.new_tensor([len(every)]), every)
-        hulls = Hulls(self.rows, self.resolution, self.cutoff, smoothed=True)
-        return bucket, hulls.near(given, torch.zeros_like(group[: len(some)]), centers, radii)
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
         """Pairs of a block (R,), counted from the start of `part`, and a cone (R,) near it."""

@@ -47,8 +47,9 @@ class RayRule:
         is the thesis's choice.
     hits_per_ray: number of points drawn for each ray. Points are cheap compared with ray traversal, and the
         hits, few for each cell, are the noisy part.
-    thinned: in the first half of the way, follow only a quarter of a viewpoint's rays, with four times the
-        weight. Rays converge toward the sensor, so they are as dense there as at the end, at half the work.
+
+    In the first half of the way, only a quarter of a viewpoint's rays are followed, with four times the
+    weight. Rays converge toward the sensor, so they are as dense there as at the end, at half the work.
     """
 
     resolution: float
@@ -60,7 +61,6 @@ class RayRule:
     empty_cutoff: float | None = None
     shell: float = 0.0
     hits_per_ray: int = 1
-    thinned: bool = False
 
     @property
     def of_empty(self) -> RayRule:
@@ -200,7 +200,6 @@ def _fused(components: Components, seen: Tensor, box: Box, rule: RayRule) -> Cel
         cutoff=(rule.cutoff, of_empty.cutoff),
         shell=rule.shell * rule.resolution,
         hits_per_ray=rule.hits_per_ray,
-        thinned=rule.thinned,
     )
     return None if found is None else CellEvidence.from_dense(window.low, *found)
 
@@ -247,8 +246,7 @@ def _evidence(
             components, components.seen_by[seen][viewpoint], rays, rule.shell * rule.resolution
         )
     starts = rays.origins
-    if rule.thinned:
-        starts, stops, weights = _thinned(starts, stops, weights, viewpoint)
+    starts, stops, weights = _thinned(starts, stops, weights, viewpoint)
     passing = torch.zeros_like(weights, dtype=torch.bool)
     struck = drawn.ends[drawn.is_hit], drawn.weights[drawn.is_hit]
     return cast_evidence(starts, stops, passing, rule.resolution, box, weights, hit_places=struck)

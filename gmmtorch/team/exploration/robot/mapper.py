@@ -282,7 +282,6 @@ class GmmMapper(Mapper):
             empty_cutoff=_EMPTY_CUTOFF,
             shell=rule.shell,
             hits_per_ray=rule.hits_per_ray,
-            thinned=True,
         )
         self._gained: dict[tuple[int, int], float] = {}  # counts that have not grown enough, by id
         self._due: dict[tuple[int, int], float] = {}  # counts that are sent with the next message
