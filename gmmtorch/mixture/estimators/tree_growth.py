@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import chunk_elements
-from gmmtorch.linalg import unpack_symmetric
+from gmmtorch.linalg import eigen, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.by_type import Factors
 from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, feature_dimension, natural_parameters
@@ -396,7 +396,7 @@ def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_cova
         count = statistics[..., 0]
         means = statistics[..., 1 : 1 + dim] / count[..., None].clamp_min(1e-300)
         second = unpack_symmetric(statistics[..., 1 + dim :] / count[..., None].clamp_min(1e-300), dim)
-        variances, axes = torch.linalg.eigh(second - means[..., :, None] * means[..., None, :])
+        variances, axes = eigen(second - means[..., :, None] * means[..., None, :])
         longest, across = variances[..., -1], axes[..., -1]
         scatter = torch.where(longest > reg_covar, count * longest, 0.0)
         n_new = min(n_pieces, n_children - n_pieces)
