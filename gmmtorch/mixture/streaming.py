@@ -292,7 +292,8 @@ def first_state(
         if state is None:
             points = survey.points - survey.center
             rows = Rows(points, points.new_ones(points.shape[0]))
-            state = State(mixture._start(rows, survey.center, generator)[0], survey.center, [])
+            (start,), _ = mixture._starts(rows, survey.center, generator)
+            state = State(start, survey.center, [])
         packed = state.pack()
     k, dim = cast(int, mixture.n_components), survey.low.shape[0]
     return State.unpack(processes.broadcast(packed), k, dim, mixture.covariance_type)
