@@ -152,9 +152,10 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
             factors = safe_cholesky(spread.view(-1, *spread.shape[-2:])).expand(len(means), -1, -1)
             sizes = labels.bincount(minlength=len(means)).tolist()
             parts = zip(normals.split(sizes), factors, strict=True)
-            points = means[labels] + torch.cat([part @ factor.T for part, factor in parts])
+            points = torch.cat([part @ factor.T for part, factor in parts])
         else:
-            points = means[labels] + normals * spread.sqrt().view(len(means), -1)[labels]
+            points = normals.mul_(spread.sqrt().view(len(means), -1)[labels])
+        points.add_(means[labels])
         return (points, labels) if self._tensors else (points.cpu().numpy(), labels.cpu().numpy())
 
     @property
