@@ -181,7 +181,7 @@ def measured(cell: Cell, packages: tuple[str, ...]) -> dict[str, dict[str, float
             value = -value if name == "torchgmm" else value  # the negative log-likelihood
             found[name].append((seconds, min(scores), megabytes, value))
             total += seconds + sum(scores)
-        if seed + 1 >= least and (total > 6 or (total > 1 and seed >= 4)):
+        if seed + 1 >= least and (total > 3 or (total > 1 and seed >= 4)):
             break
     result = {}
     for name, runs in found.items():

@@ -75,6 +75,20 @@ def safe_cholesky(matrices: Tensor, name: str = "covariances") -> Tensor:
     )
 
 
+def eigen(matrices: Tensor, name: str = "covariances") -> tuple[Tensor, Tensor]:
+    """Eigenvalues (…, D), ascending, and eigenvectors (…, D, D), of symmetric matrices (…, D, D).
+
+    Raises `NumericalError` if entries are NaN or infinite.
+    """
+    try:
+        values, vectors = torch.linalg.eigh(matrices)
+    except torch.linalg.LinAlgError as error:
+        raise NumericalError(
+            f"{name} has NaN or infinite entries; check the input points, and scale them if they are large."
+        ) from error
+    return values, vectors
+
+
 def inverse_factor(factors: Tensor) -> Tensor:
     """L⁻ᵀ (K, D, D) of lower Cholesky factors L; ‖(x−μ)ᵀ L⁻ᵀ‖² is the squared Mahalanobis distance."""
     eye = torch.eye(factors.shape[-1], dtype=factors.dtype, device=factors.device)

@@ -152,9 +152,10 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
             factors = safe_cholesky(spread.view(-1, *spread.shape[-2:])).expand(len(means), -1, -1)
             sizes = labels.bincount(minlength=len(means)).tolist()
             parts = zip(normals.split(sizes), factors, strict=True)
-            points = means[labels] + torch.cat([part @ factor.T for part, factor in parts])
+            points = torch.cat([part @ factor.T for part, factor in parts])
         else:
-            points = means[labels] + normals * spread.sqrt().view(len(means), -1)[labels]
+            points = normals.mul_(spread.sqrt().view(len(means), -1)[labels])
+        points.add_(means[labels])
         return (points, labels) if self._tensors else (points.cpu().numpy(), labels.cpu().numpy())
 
     @property
@@ -265,11 +266,9 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         return value if self._tensors else value.cpu().numpy()
 
     def _as_kind_of(self, X: Array, value: Tensor) -> Array:
-        """`value` as an array or tensor like X, in the dtype of X if that is a floating type."""
-        if isinstance(X, Tensor):
-            return value.to(X.dtype) if X.is_floating_point() else value
-        dtype = getattr(X, "dtype", np.dtype(np.float64))
-        return value.cpu().numpy().astype(dtype if dtype == np.float32 else np.float64, copy=False)
+        """`value` as an array or tensor like X, in float32 for such an X: half precision has no −70,000."""
+        value = value.float() if getattr(X, "dtype", None) in (torch.float32, np.float32) else value
+        return value if isinstance(X, Tensor) else value.cpu().numpy()
 
     def __sklearn_is_fitted__(self) -> bool:
         return "means" in self._buffers

@@ -20,7 +20,7 @@ from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters
 from gmmtorch.mixture.em.initialization import (
     INITIALIZATIONS,
     flat_pieces,
-    initialize,
+    initializations,
     replicated,
     surface_pieces,
 )
@@ -175,7 +175,7 @@ class GaussianMixture(MixtureEstimator):
             previous = self._current_parameters(points, center)
         else:
             rows, generator = Rows(points, weight), as_generator(self.random_state)
-            previous, _ = self._start(rows, center, generator)
+            (previous,), _ = self._starts(rows, center, generator)
         kind, dtype = self.covariance_type, em.SOFTMAX_DTYPES[self.dtype]
         step = loop.em_step(Rows(points, weight), float(self.reg_covar), dtype, kind)
         update, bound = step(previous)
@@ -220,8 +220,7 @@ class GaussianMixture(MixtureEstimator):
             return []
         if not is_small(rows.values, rows.weight, k, kind):
             return []
-        n_starts = 1 if self._continues() else self.n_init
-        starts = [self._start(rows, center, generator)[0] for _ in range(n_starts)]
+        starts, _ = self._starts(rows, center, generator, 1 if self._continues() else self.n_init)
         stacked, last = Parameters(*map(torch.stack, zip(*starts, strict=True))), self._previous_bound()
         settings = kind, float(self.reg_covar), self.tol, self.max_iter, last
         found = fused_em(rows.values, rows.weight, stacked, *settings)
@@ -243,7 +242,7 @@ class GaussianMixture(MixtureEstimator):
         """EM from one start, or from what is known of it."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
         if known is None:
-            first, owner = self._start(rows, center, generator)
+            (first,), owner = self._starts(rows, center, generator)
         else:
             first, owner = known.parameters, None
             for iteration, bound in enumerate(known.lower_bounds, 1):
@@ -275,12 +274,12 @@ class GaussianMixture(MixtureEstimator):
             previous_bound=self._previous_bound(),
         )
 
-    def _start(
-        self, rows: Rows, center: Tensor, generator: torch.Generator
-    ) -> tuple[Parameters, Tensor | None]:
-        """Start of EM in the centred frame, and a likely component of each row (N,), if known."""
+    def _starts(
+        self, rows: Rows, center: Tensor, generator: torch.Generator, n_starts: int = 1
+    ) -> tuple[list[Parameters], Tensor | None]:
+        """Starts of EM in the centred frame, and a likely component of each row (N,), if known."""
         if self._continues():
-            return self._current_parameters(rows.points, center), None
+            return [self._current_parameters(rows.points, center)], None
         n, k, reg, owner = rows.weight.shape[0], self.n_components, float(self.reg_covar), None
         dim = rows.points.shape[1]
         features = None if rows.are_points else rows.values
@@ -288,15 +287,15 @@ class GaussianMixture(MixtureEstimator):
         if k is None:
             found, owner = surface_pieces(rows.points, rows.weight, float(self.noise), reg, features)
         elif len(given) == len(Parameters._fields):
-            return Parameters(**given), None
+            return [Parameters(**given)] * n_starts, None
         elif not given and self._truncates(n, k, dim) and self._initialization(n, k, dim) == "flat_pieces":
             found, owner = flat_pieces(rows.points, rows.weight, k, reg, features)
             found = replicated(found, k)
         else:
             method, kind = self._initialization(n, k, dim), self.covariance_type
-            found = initialize(method, rows.points, rows.weight, k, reg, generator, kind)
-            return found._replace(**given), owner
-        return by_type.compacted(found, self.covariance_type)._replace(**given), owner
+            several = initializations(method, rows.points, rows.weight, k, reg, generator, kind, n_starts)
+            return [one._replace(**given) for one in several], owner
+        return [by_type.compacted(found, self.covariance_type)._replace(**given)] * n_starts, owner
 
     def _given_start(self, dim: int, center: Tensor) -> dict[str, Tensor]:
         """Those of the initial `Parameters` that were given, in the centred frame."""

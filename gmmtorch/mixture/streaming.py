@@ -61,7 +61,8 @@ def fit_stream(
     """Fit a mixture to the points of a source: `GaussianMixture.fit` with memory bounded by a chunk.
 
     One pass over the source counts, centres and samples the points. Each EM iteration is one further
-    pass, or two if the parameters are too ill-conditioned for natural parameters.
+    pass, or two if the parameters are too ill-conditioned for natural parameters. A source of one chunk is
+    read once more only, unless there are checkpoints.
 
     With `algorithm="truncated"`, which stores the owner of each point, every process keeps its points in
     memory (about 130 bytes per point in total), and the result depends slightly on how the points are
@@ -112,9 +113,17 @@ def fit_stream(
             rows, owner = Rows(points, points.new_ones(len(points))), nearest(points, parameters.means)
             result = fit_truncated(rows, owner, parameters, mixture._settings(on_iteration, processes))
         else:
-            step = _stream_step(mixture, source, processes, center, e_step, survey.n_points)
+            step: loop.Step[Parameters]
+            is_one_chunk = processes.size == 1 and source.n_rows <= source.chunk_points
+            if is_one_chunk and e_step is None and write is None:  # which stays in memory
+                points = torch.cat([chunk.points for chunk in source]).to(device) - center
+                settings = float(mixture.reg_covar), em.SOFTMAX_DTYPES[mixture.dtype], mixture.covariance_type
+                step = loop.em_step(Rows(points, points.new_ones(len(points))), *settings)
+            else:
+                step = _stream_step(mixture, source, processes, center, e_step, survey.n_points)
+                step = _noted(step, done, write)
             result = loop.run_em(
-                _noted(step, done, write),
+                step,
                 parameters,
                 tol=mixture.tol,
                 max_iter=mixture.max_iter,
@@ -292,7 +301,8 @@ def first_state(
         if state is None:
             points = survey.points - survey.center
             rows = Rows(points, points.new_ones(points.shape[0]))
-            state = State(mixture._start(rows, survey.center, generator)[0], survey.center, [])
+            (start,), _ = mixture._starts(rows, survey.center, generator)
+            state = State(start, survey.center, [])
         packed = state.pack()
     k, dim = cast(int, mixture.n_components), survey.low.shape[0]
     return State.unpack(processes.broadcast(packed), k, dim, mixture.covariance_type)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import numpy as np
@@ -15,7 +16,8 @@ from torch.utils._pytree import tree_leaves
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import GmmTorchError, NumericalError
-from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
+from gmmtorch.mixture import HierarchicalGaussianMixture as Tree
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, constrain, expand, type_shape
 from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
@@ -295,8 +297,12 @@ def test_bad_tables_give_a_fit_as_good_as_that_of_scikit_learn(kind, case, metho
 def test_numbers_too_large_to_square_are_an_error(kind):
     x = torch.from_numpy(PAIR * 1e200)
     start = {"init_params": "random_points", "random_state": 0}
-    with pytest.raises(GmmTorchError):
-        GaussianMixture(2, covariance_type=kind, **start).fit(x)
+    for made in (GaussianMixture(2, covariance_type=kind, **start), VariationalGaussianMixture(2), Tree()):
+        with pytest.raises(GmmTorchError):
+            made.fit(x)
+    assert math.isfinite(GaussianMixture(2, covariance_type=kind, **start).fit(x / 1e50).score(x / 1e50))
+    with pytest.raises(NumericalError, match="scale them"):
+        Tree().fit(x / 1e50)
 
 
 @pytest.mark.parametrize("kind", ["diag", "spherical"])

@@ -130,6 +130,23 @@ def test_kmeans_start_has_the_moments_of_the_clusters():
         np.testing.assert_allclose(covariances[i].numpy(), expected, rtol=1e-8, atol=1e-11)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_several_starts_differ_from_each_other_and_are_those_of_any_batches(method, monkeypatch):
+    points, weight = cloud(200, 3), torch.ones(200).double()
+    found = []
+    for at_once in (1 << 20, 1):
+        monkeypatch.setattr(initialization, "_DISTANCES", at_once)
+        settings = 5, 1e-6, torch.Generator().manual_seed(3), "full", 4
+        found.append([*initialization.initializations(method, points, weight, *settings)])
+    together, apart = found
+    assert len(together) == len(apart) == 4
+    means = {tuple(one.means.flatten().tolist()) for one in together}
+    assert len(means) > 1 or method in ("flat_pieces", "kmeans_restarts")
+    assert all(float(one.weights.sum()) == pytest.approx(1) for one in together)
+    for one, other in zip(together, apart, strict=True):
+        torch.testing.assert_close(one.means, other.means)
+
+
 def test_kmeans_restarts_keep_the_clustering_of_least_scatter():
     points = cloud(400, 2)
 

@@ -6,8 +6,7 @@ only. A point of weight 2 and the same point given twice therefore give the same
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -24,6 +23,7 @@ from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool, pool_in
 
 _FEWEST_CELLS, _CELLS_OF_A_COMPONENT = 4096, 8  # lower limits of the cells for flat pieces
 _FINEST_CELLS = 1 << 14  # along the longest side
+_DISTANCES = 1 << 20  # of runs of k-means that are made at once
 _SURFACE_CELLS = 1 << 17  # `surface_pieces` partitions cells from twice this number of points on
 
 
@@ -92,24 +92,41 @@ def _hash(points: Tensor, rows: Tensor) -> Tensor:
     return torch.cat(found)
 
 
-def _kmeans_clusters(start: Start, n_init: int = 1) -> Parameters:
-    """The moments of k-means clusters; of `n_init` runs, the clustering with least scatter."""
-    points, weight, _, _, k, reg_covar, generator, kind = start
-    labels, scatter = kmeans(*start[:4], k, generator, n_init)
-    best = labels[scatter.argmin()]
+Method = Callable[[Start, int], Iterator[Parameters]]
+"""Gives a number of starts."""
+
+
+def _one_by_one(make: Callable[[Start], Parameters]) -> Method:
+    return lambda start, n_starts: (make(start) for _ in range(n_starts))
+
+
+def _kmeans_clusters(start: Start, n_starts: int) -> Iterator[Parameters]:
+    """The moments of the clusters of each run of k-means."""
+    labels, _ = kmeans(*start[:4], start.n_components, start.generator, n_starts)
+    return (_moments_of_clusters(start, own) for own in labels)
+
+
+def _best_clusters(start: Start) -> Parameters:
+    """Of ten runs of k-means, the clustering with least scatter."""
+    labels, scatter = kmeans(*start[:4], start.n_components, start.generator, 10)
+    return _moments_of_clusters(start, labels[scatter.argmin()])
+
+
+def _moments_of_clusters(start: Start, labels: Tensor) -> Parameters:
+    points, weight, _, _, k, reg_covar, _, kind = start
     if is_small(points, weight, k, kind):
-        return Parameters(*fused_moments(points, weight, best, k, kind, reg_covar))
+        return Parameters(*fused_moments(points, weight, labels, k, kind, reg_covar))
     if points.shape[1] > 3:
-        found = by_type.moments_of_labels(points, weight, best, k, kind)
+        found = by_type.moments_of_labels(points, weight, labels, k, kind)
         return by_type.maximized(found, reg_covar, None, kind)
-    found = moments_of(em.quadratic_features(points), weight, best, k, reg_covar, points)
+    found = moments_of(em.quadratic_features(points), weight, labels, k, reg_covar, points)
     return by_type.compacted(found, kind)
 
 
-def _far_points(start: Start) -> Parameters:
+def _far_points(start: Start, n_starts: int) -> Iterator[Parameters]:
     """Components of one point each, chosen far apart as k-means++ does, with variance `reg_covar`."""
-    chosen = spread_out(*start[:4], start.n_components, start.generator)[0]
-    return start.isotropic(start.points[chosen], start.reg_covar)
+    chosen = spread_out(*start[:4], start.n_components, start.generator, n_starts)
+    return (start.isotropic(start.points[own], start.reg_covar) for own in chosen)
 
 
 def _random_responsibilities(start: Start) -> Parameters:
@@ -222,15 +239,15 @@ def moments_of(
     return Parameters(found.weights, means + found.means, found.covariances)
 
 
-INITIALIZATIONS: dict[str, Callable[[Start], Parameters]] = {
+INITIALIZATIONS: dict[str, Method] = {
     "kmeans": _kmeans_clusters,
-    "kmeans_restarts": functools.partial(_kmeans_clusters, n_init=10),
+    "kmeans_restarts": _one_by_one(_best_clusters),
     "k-means++": _far_points,
-    "random": _random_responsibilities,
-    "random_from_data": lambda start: start.isotropic(start.drawn(), start.reg_covar),
-    "random_points": lambda start: start.tiling(start.drawn()),
-    "bounding_box": _bounding_box,
-    "flat_pieces": _one_of_each_piece,
+    "random": _one_by_one(_random_responsibilities),
+    "random_from_data": _one_by_one(lambda start: start.isotropic(start.drawn(), start.reg_covar)),
+    "random_points": _one_by_one(lambda start: start.tiling(start.drawn())),
+    "bounding_box": _one_by_one(_bounding_box),
+    "flat_pieces": _one_by_one(_one_of_each_piece),
 }
 """Methods by name. "random_from_data", of scikit-learn, gives each drawn point the variance `reg_covar`."""
 
@@ -244,9 +261,24 @@ def initialize(
     generator: torch.Generator,
     covariance_type: str = "full",
 ) -> Parameters:
+    """The first of the `initializations`."""
+    settings = n_components, reg_covar, generator, covariance_type
+    return next(initializations(method, points, weight, *settings))
+
+
+def initializations(
+    method: str,
+    points: Tensor,
+    weight: Tensor,
+    n_components: int,
+    reg_covar: float,
+    generator: torch.Generator,
+    covariance_type: str,
+    n_starts: int = 1,
+) -> Iterator[Parameters]:
     """Starting parameters of K components for centred points with any number of distinct rows.
 
-    Covariances have the shape of the type.
+    Covariances have the shape of the type. Runs of k-means on small tables are made at once.
 
     If there are fewer distinct points than components, each distinct point gives one component, and the
     other components are copies that share its weight. The density is then that of the distinct points.
@@ -254,7 +286,12 @@ def initialize(
     rows, mass = distinct(points, weight)
     n = min(n_components, rows.shape[0])
     start = Start(points, weight, rows, mass, n, reg_covar, generator, covariance_type)
-    return replicated(INITIALIZATIONS[method](start), n_components, covariance_type)
+    at_once = max(1, _DISTANCES // (len(points) * (2 + n.bit_length())))
+    while n_starts > 0:
+        found = INITIALIZATIONS[method](start, min(at_once, n_starts))
+        n_starts -= at_once
+        for one in found:
+            yield replicated(one, n_components, covariance_type)
 
 
 def replicated(found: Parameters, n_components: int, kind: str = "full") -> Parameters:

@@ -80,9 +80,8 @@ def spread_out(
         mass: (M,) their weights.
     """
 
-    def draw(heights: Tensor, n: int) -> Tensor:
+    def draw(heights: Tensor, at: Tensor) -> Tensor:
         heights = heights.cumsum(1)
-        at = torch.rand(n_runs, n, generator=generator, dtype=torch.float64).to(heights.device)
         found = torch.searchsorted(heights, at * heights[:, -1:], right=True)
         return rows[found.clamp_max_(len(rows) - 1)]
 
@@ -95,10 +94,12 @@ def spread_out(
 
     square = torch.linalg.vector_norm(points, dim=1).square()
     n_trials = 2 + int(math.log(n_centers))
-    chosen = [draw(mass.expand(n_runs, -1), 1)]
+    n_draws = 1 + (n_centers - 1) * n_trials  # of a run, which has the same draws alone
+    at = torch.rand(n_runs, n_draws, generator=generator, dtype=torch.float64).to(points.device)
+    chosen = [draw(mass.expand(n_runs, -1), at[:, :1])]
     closest = distances(chosen[0])
-    while len(chosen) < n_centers:
-        trials = draw(closest[:, 0, rows] * mass, n_trials)
+    for begin in range(1, n_draws, n_trials):
+        trials = draw(closest[:, 0, rows] * mass, at[:, begin : begin + n_trials])
         left = torch.minimum(distances(trials), closest)
         best = (left @ weight).argmin(1, keepdim=True)
         chosen.append(trials.gather(1, best))

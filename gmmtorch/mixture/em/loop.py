@@ -12,7 +12,14 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError, check_number
-from gmmtorch.kernels import fused_exact_em, in_spatial_order, is_em_fused, takes_one_launch
+from gmmtorch.kernels import (
+    fused_em,
+    fused_exact_em,
+    in_spatial_order,
+    is_em_fused,
+    is_small,
+    takes_one_launch,
+)
 from gmmtorch.mixture.em import by_type
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.reduction import merge_pairs
@@ -108,7 +115,8 @@ def em_step(
     """EM steps on points, centred, or cells. Covariances have the shape of their type.
 
     A step on points whose linear form loses digits takes the direct one; in many dimensions, so do all later
-    steps. In few dimensions, a fused kernel takes many steps in one launch where that is faster.
+    steps. In few dimensions and on small tables, a fused kernel takes many steps in one launch where that is
+    faster.
     """
     points, weight, kind = rows.points, rows.weight, covariance_type
     total, direct = weight.sum(), [False]
@@ -145,12 +153,19 @@ def em_step(
     steps = _ahead(step, checked, 1 if points.device.type == "cpu" else _STEPS_AHEAD)
 
     def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
-        fits = few is not None and kind == "full" and takes_one_launch(len(weight), len(parameters.weights))
-        if few is None or not fits or not is_em_fused(*few, *parameters):
+        k = len(parameters.weights)
+        fits = few is not None and kind == "full" and takes_one_launch(len(weight), k)
+        if rows.are_points and is_small(points, weight, k, kind):
+            start = Parameters(*(part[None].clone() for part in parameters))
+            found = fused_em(points, weight, start, kind, reg_covar, tol, n_most, last)
+            mixture = found.weights[0], found.means[0], found.covariances[0]
+            (bounds,), (failed,) = found.bounds, found.failed
+        elif few is None or not fits or not is_em_fused(*few, *parameters):
             return steps.run(parameters, tol, n_most, last)
-        mixture, bounds, failed = fused_exact_em(
-            *few, parameters, reg_covar, tol, n_most, last, guarded=rows.are_points
-        )
+        else:
+            mixture, bounds, failed = fused_exact_em(
+                *few, parameters, reg_covar, tol, n_most, last, guarded=rows.are_points
+            )
         if not failed:
             return Parameters(*mixture), bounds
         new, bound = checked(Parameters(*mixture))

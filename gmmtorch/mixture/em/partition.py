@@ -30,7 +30,7 @@ from gmmtorch.kernels import (
     cell_moments,
     piece_cuts,
 )
-from gmmtorch.linalg import dense_ranks, on_cpu, unpack_symmetric
+from gmmtorch.linalg import dense_ranks, eigen, on_cpu, unpack_symmetric
 from gmmtorch.mixture.em.exact import quadratic_features
 
 _MAX_LEVELS = 64
@@ -124,7 +124,7 @@ def partition(
         count = statistics[:, 0].clamp_min(1e-300)
         means = statistics[:, 1 : 1 + dim] / count[:, None]
         second = unpack_symmetric(statistics[:, 1 + dim :] / count[:, None], dim)
-        variances, directions = torch.linalg.eigh(second - means[:, :, None] * means[:, None, :])
+        variances, directions = eigen(second - means[:, :, None] * means[:, None, :])
         deviation = variances.clamp_min(0).sqrt()
         wanted = (deviation[:, 0] > rule.thickness) | (deviation[:, -1] > rule.length)
         thick = (deviation[:, 0] > 2 * rule.thickness).to(count)

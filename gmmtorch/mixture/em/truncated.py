@@ -407,7 +407,7 @@ def truncated_expectation(
     n_blocks, block, n_features = groups.features.shape
     dtype = groups.features.dtype
     natural = _local_parameters(own, parameters.means, groups.centers, candidates).to(dtype)
-    sums = torch.zeros(n_groups, n_features * m, dtype=dtype, device=candidates.device)
+    sums = torch.zeros(n_groups, m * n_features, dtype=dtype, device=candidates.device)
     value = torch.zeros((), dtype=torch.float64, device=candidates.device)
     likeliest = torch.empty_like(groups.weight, dtype=torch.int64) if want_owner else None
 
@@ -415,15 +415,15 @@ def truncated_expectation(
         features, owner = groups.features[part], groups.owner[part]
         block_natural = natural.index_select(0, owner)
         best = candidates[owner].gather(1, _likeliest(block_natural, features)) if want_owner else None
-        return part, *_block_sums(block_natural, features, groups.weight[part]), best
+        return part, *sums_of_blocks(block_natural, features.transpose(1, 2), groups.weight[part]), best
 
     step = max(1, chunk_elements(groups.owner.device) // (block * m))
     for part, block_statistics, block_value, best in chunked(n_blocks, step, sums_of):
         sums.index_add_(0, groups.owner[part], block_statistics)
-        value += block_value
+        value += block_value.sum()
         if likeliest is not None and best is not None:
             likeliest[part] = best
-    by_pair = sums.view(n_groups, n_features, m).transpose(1, 2).double()
+    by_pair = sums.view(n_groups, m, n_features).double()
     about_means = em.shift_features(by_pair, groups.centers[:, None] - parameters.means[candidates])
     statistics = about_means.new_zeros(parameters.weights.shape[0], n_features)
     statistics.index_add_(0, candidates.flatten(), about_means.flatten(0, 1))
@@ -451,16 +451,18 @@ def _local_parameters(own: Tensor, means: Tensor, centers: Tensor, candidates: T
     return torch.cat([constant[..., None], linear, doubled[candidates]], -1)
 
 
-def _block_sums(natural: Tensor, features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Σγφ (b, F·m) and Σ p log Σ exp of blocks: natural (b, m, F), features (b, B, F), weight (b, B)."""
+def sums_of_blocks(natural: Tensor, features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Σγφ (b, m·F) and Σ p log Σ exp (b,), float64, of blocks: natural (b, m, F), features (b, F, B), weight
+    (b, B).
+    """
     floor = em.exponent_floor(features.dtype)
     # Candidates are the rows, so that reductions over candidates run along contiguous memory.
-    gamma = torch.bmm(natural, features.transpose(1, 2))  # (b, m, B)
+    gamma = torch.bmm(natural, features)  # (b, m, B)
     peak = gamma.amax(1, keepdim=True)
     norm = gamma.sub_(peak).clamp_(min=floor).exp_().sum(1)
-    value = (weight * (peak[:, 0] + norm.log())).sum(dtype=torch.float64)
+    value = (weight * (peak[:, 0] + norm.log())).sum(1, dtype=torch.float64)
     gamma.mul_((weight / norm)[:, None])
-    return torch.bmm(features.transpose(1, 2), gamma.transpose(1, 2)).flatten(1), value
+    return torch.bmm(gamma, features.transpose(1, 2)).flatten(1), value
 
 
 def _likeliest(natural: Tensor, features: Tensor) -> Tensor:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import fused_em, is_small
-from gmmtorch.linalg import safe_cholesky
+from gmmtorch.linalg import eigen, safe_cholesky
 from gmmtorch.mixture.em import by_type, loop
 from gmmtorch.mixture.em.exact import LOG_2PI, Parameters, compact, constrain, type_shape
 
@@ -68,7 +68,7 @@ def unbiased_covariance(
         variances = torch.where(flat, variances.clamp_min(thickness), variances)
         return constrain(torch.diag(variances)[None], covariance_type)[0]
     covariance = (points * weight[:, None]).T @ points / count
-    variances, directions = torch.linalg.eigh(covariance)
+    variances, directions = eigen(covariance)
     if float(variances[0]) > 1e-14 * float(variances[-1]):
         return covariance
     return (directions * variances.clamp_min(thickness)) @ directions.T

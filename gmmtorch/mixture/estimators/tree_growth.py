@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels import chunk_elements
-from gmmtorch.linalg import unpack_symmetric
+from gmmtorch.linalg import eigen, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.by_type import Factors
 from gmmtorch.mixture.em.exact import SOFTMAX_DTYPES, Parameters, feature_dimension, natural_parameters
-from gmmtorch.mixture.em.truncated import Rows, group_rows
+from gmmtorch.mixture.em.truncated import Rows, group_rows, sums_of_blocks
 
 if TYPE_CHECKING:
     from gmmtorch.mixture.estimators.hierarchical import DensityLimit
@@ -339,18 +339,14 @@ def expectation(packed: Packed, children: Children) -> tuple[Tensor, Tensor]:
     """The E-step in all nodes: statistics (G, m, F) and Σ p log Σ_children (G,), float64."""
     n_nodes, m = children.weights.shape
     natural = children.natural(packed.values.dtype)
-    n_features, floor = natural.shape[2], em.exponent_floor(natural.dtype)
-    sums = natural.new_zeros(n_nodes, m * n_features, dtype=torch.float64)
+    sums = natural.new_zeros(n_nodes, m * natural.shape[2], dtype=torch.float64)
     value = natural.new_zeros(n_nodes, dtype=torch.float64)
     for _, features, weight, node in packed.chunks(m):
-        gamma = torch.bmm(natural.index_select(0, node), features)  # (b, m, B)
-        peak = gamma.amax(1, keepdim=True)
-        norm = gamma.sub_(peak).clamp_(min=floor).exp_().sum(1)
-        value.index_add_(0, node, (weight * (peak[:, 0] + norm.log())).sum(1).double())
-        gamma.mul_((weight / norm)[:, None])
+        of_blocks, values = sums_of_blocks(natural.index_select(0, node), features, weight)
         # Summed in float64, so that rounding errors average out over the blocks of a large node.
-        sums.index_add_(0, node, torch.bmm(gamma, features.transpose(1, 2)).flatten(1).double())
-    return sums.view(n_nodes, m, n_features), value
+        sums.index_add_(0, node, of_blocks.double())
+        value.index_add_(0, node, values)
+    return sums.view_as(natural), value
 
 
 def maximization(
@@ -400,7 +396,7 @@ def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_cova
         count = statistics[..., 0]
         means = statistics[..., 1 : 1 + dim] / count[..., None].clamp_min(1e-300)
         second = unpack_symmetric(statistics[..., 1 + dim :] / count[..., None].clamp_min(1e-300), dim)
-        variances, axes = torch.linalg.eigh(second - means[..., :, None] * means[..., None, :])
+        variances, axes = eigen(second - means[..., :, None] * means[..., None, :])
         longest, across = variances[..., -1], axes[..., -1]
         scatter = torch.where(longest > reg_covar, count * longest, 0.0)
         n_new = min(n_pieces, n_children - n_pieces)

@@ -5,7 +5,7 @@ The prior and the iterations are those of `gmmtorch.mixture.em.variational_bayes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 from numbers import Integral
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ from gmmtorch.linalg import check_symmetric, safe_cholesky
 from gmmtorch.mixture.density import NotFittedError
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, compact, expand, type_shape
-from gmmtorch.mixture.em.initialization import initialize
+from gmmtorch.mixture.em.initialization import initializations
 from gmmtorch.mixture.em.loop import EMResult, OnIteration, run_em
 from gmmtorch.mixture.em.variational_bayes import (
     Posterior,
@@ -144,14 +144,15 @@ class VariationalGaussianMixture(MixtureEstimator):
     # -- learning ---------------------------------------------------------------------------------
 
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
-        prior = self._prior(cloud)
-        generator = as_generator(self.random_state)
+        prior, reg, generator = self._prior(cloud), float(self.reg_covar), as_generator(self.random_state)
+        settings = self.n_components, reg, generator, self.covariance_type, self.n_init
+        starts = initializations(self.init_params, cloud.points, cloud.weight, *settings)
         step = variational_step(
             cloud.points,
             cloud.weight,
             prior,
             self.weight_concentration_prior_type == "dirichlet_process",
-            float(self.reg_covar),
+            reg,
             em.SOFTMAX_DTYPES[self.dtype],
             self.covariance_type,
         )
@@ -159,7 +160,7 @@ class VariationalGaussianMixture(MixtureEstimator):
         def run(report: OnIteration | None) -> EMResult[Posterior]:
             return run_em(
                 step,
-                self._first_posterior(cloud, prior, generator),
+                self._first_posterior(cloud, prior, starts),
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=report,
@@ -178,19 +179,18 @@ class VariationalGaussianMixture(MixtureEstimator):
     def _continues(self) -> bool:
         return super()._continues() and "concentration" in self._buffers
 
-    def _first_posterior(self, cloud: Cloud, prior: Prior, generator: torch.Generator) -> Posterior:
+    def _first_posterior(self, cloud: Cloud, prior: Prior, starts: Iterator[Parameters]) -> Posterior:
         """Posterior of the initial moments, or of the last fit, relative to the cloud's centre."""
         if self._continues():
             last = Posterior(*(value.to(cloud.points.device) for value in self._posterior()))
             self._check_continues(cloud.points)
             return last._replace(means=last.means - cloud.center)
-        k, kind, reg = self.n_components, self.covariance_type, float(self.reg_covar)
-        first = initialize(self.init_params, cloud.points, cloud.weight, k, reg, generator, kind)
+        first = next(starts)
         # Stick-breaking depends on the order of components. With the largest component first the bound is
         # best and does not depend on the frame.
         order = first.weights.argsort(descending=True, stable=True)
         count = first.weights[order] * cloud.weight.sum()
-        covariances = first.covariances if kind == "tied" else first.covariances[order]
+        covariances = first.covariances if self.covariance_type == "tied" else first.covariances[order]
         moments = Parameters(count, first.means[order], covariances)
         process = self.weight_concentration_prior_type == "dirichlet_process"
         return update(prior, moments, process, self.covariance_type)
