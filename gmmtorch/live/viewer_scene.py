@@ -213,9 +213,10 @@ def height_shades(places: Tensor) -> np.ndarray:
 def _steady_scale(heights: Tensor) -> Any:
     """The colour scale of heights (N,), metres, whose ends are rounded, so that a map that grows a little
     keeps its colours."""
-    scale = height_scale(heights)
-    step = 2.0 ** math.floor(math.log2((scale.vmax - scale.vmin) / _SCALE_STEPS))
-    scale.vmin, scale.vmax = step * math.floor(scale.vmin / step), step * math.ceil(scale.vmax / step)
+    scale: Any = height_scale(heights)
+    low, high = scale.vmin, scale.vmax
+    step = 2.0 ** math.floor(math.log2((high - low) / _SCALE_STEPS))
+    scale.vmin, scale.vmax = step * math.floor(low / step), step * math.ceil(high / step)
     return scale
 
 
