@@ -6,11 +6,14 @@ FOLDER holds kinect/ and courtyard/; building is simulated. Every 5th scan is he
 colours at points of held-out frames, from every 4th pixel of every 4th row. The colour camera was calibrated
 on the other frames. building: share of points with the right class of floor, ceiling, wall and furniture.
 courtyard: correlation of the reflectivity, and its RMS error. A cell of a grid takes 6 bytes for its place,
-and 3 for a colour or 1 for an intensity or a class.
+and 3 for a colour or 1 for an intensity or a class. *octree* is the same grid as a compressed octree, with
+values in steps of 8 from their predecessors (LZMA); like the grid, it knows nothing of free space. *frames
+before and after* are the 8 nearest points of the two neighbouring frames, within 3 cm: no map.
 """
 
 from __future__ import annotations
 
+import lzma
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -20,23 +23,24 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import torch
+from scipy.spatial import cKDTree
 from sklearn.metrics import roc_auc_score
 from torch import Tensor
 
 from gmmtorch import GaussianMap, IncrementalRule, Scan
 from gmmtorch.datasets import load
 from gmmtorch.experiments.harness import Case, Row, run
-from gmmtorch.scan import display_colours
+from gmmtorch.scan import display_colours, linear_colours
 from gmmtorch.simulation import building_3d, poses_3d, simulate_scan, spinning_lidar
 from gmmtorch.team.sharing import Replica
 
-EVERY, N_POINTS, N_RUNS = 5, 60_000, 3
+EVERY, N_POINTS, N_RUNS, STEP = 5, 60_000, 3, 8
 COLOUR_INTRINSICS = "522.6 0 320\n0 522.6 240\n0 0 1\n"
 COLOUR_POSE = "1 0 0 -0.0275\n0 1 0 -0.004\n0 0 1 0\n0 0 0 1\n"
 PLACE_BYTES = 6
 CELL = {"kinect": 0.05, "building": 0.1, "courtyard": 0.2}
-BUDGETS = {"kinect": (8000, 16_000, 32_000, None), "building": (8000, 16_000), "courtyard": (16_000, 32_000)}
-VALUE_BYTES = {"colour": 3, "class": 1, "intensity": 1}
+BUDGETS: dict[str, tuple[int | None, ...]]
+BUDGETS = {"kinect": (8000, 16_000, None), "building": (8000,), "courtyard": (16_000, None)}
 
 
 def kinect(data: Path) -> list[Scan]:
@@ -118,19 +122,56 @@ def known_points(scans: Sequence[Scan], channel: str) -> tuple[Tensor, Tensor]:
     return points[known], values[known]
 
 
-def grid(points: Tensor, values: Tensor, side: float, asked: Tensor) -> tuple[Tensor, Tensor, int]:
+def grid(
+    points: Tensor, values: Tensor, side: float, asked: Tensor, step: int = 0
+) -> tuple[Tensor, Tensor, int, int]:
     """Mean value, or most frequent label, of the cell of each point; that of all where no point fell. Which
-    points are known, and the number of cells."""
-    target = values.double() if values.is_floating_point() else torch.nn.functional.one_hot(values).double()
+    points are known, the number of cells, and their bytes; with `step`, those of a compressed octree."""
+    is_number = values.is_floating_point()
+    target = values.double() if is_number else torch.nn.functional.one_hot(values).double()
     both = (torch.cat([points, asked]) / side).floor().long()
     cells, cell = torch.unique(both, dim=0, return_inverse=True)
     own, of_asked = cell[: len(points)], cell[len(points) :]
     count = torch.bincount(own, minlength=len(cells)).double()
     mean = target.new_zeros(len(cells), target.shape[1]).index_add_(0, own, target)
     mean /= count.clamp_min(1)[:, None]
-    known = count[of_asked] > 0
+    full = count > 0
+    n = int(full.sum())
+    n_bytes = n * (PLACE_BYTES + (values.shape[1] if is_number else 1))
+    if step:
+        is_colour = values.shape[1] == 3
+        levels = (255 * display_colours(mean) if is_colour else mean).div(step).round()
+        n_bytes = octree_bytes(cells[full].numpy(), levels[full].long().numpy())
+        mean = linear_colours((levels * step / 255).clamp(0, 1)) if is_colour else levels * step
+    known = full[of_asked]
     found = torch.where(known[:, None], mean[of_asked], target.mean(0))
-    return found if values.is_floating_point() else found.argmax(1), known, int((count > 0).sum())
+    return found if is_number else found.argmax(1), known, n, n_bytes
+
+
+def octree_bytes(cells: np.ndarray, levels: np.ndarray) -> int:
+    """Bytes of an octree of cells (n, 3) as masks of children, and of their levels (n, 1 or 3): green, red
+    and blue less green, each from the cell before in Morton order."""
+    place, code = cells - cells.min(0), np.zeros(len(cells), np.int64)
+    for bit in range(16):
+        for axis in range(3):
+            code |= ((place[:, axis] >> bit) & 1) << (3 * bit + axis)
+    order = np.argsort(code)
+    masks, left = [], code[order]
+    while len(left) > 1 or not masks:
+        parents, parent = np.unique(left >> 3, return_inverse=True)
+        mask = np.zeros(len(parents), np.uint8)
+        np.bitwise_or.at(mask, parent, (1 << (left & 7)).astype(np.uint8))
+        masks, left = [mask, *masks], parents
+    levels = levels[order]
+    if levels.shape[1] == 3:
+        levels = np.column_stack([levels[:, 1], levels[:, 0] - levels[:, 1], levels[:, 2] - levels[:, 1]])
+    changes = np.diff(levels, axis=0, prepend=0).astype(np.int8)
+    return sum(map(packed, (np.concatenate(masks), *changes.T)))
+
+
+def packed(values: np.ndarray) -> int:
+    code = {"id": lzma.FILTER_LZMA2, "preset": 9 | lzma.PRESET_EXTREME, "lc": 0, "lp": 0, "pb": 0}
+    return len(lzma.compress(values.tobytes(), lzma.FORMAT_RAW, filters=[code]))
 
 
 def score(channel: str, found: Tensor, true: Tensor) -> str:
@@ -186,30 +227,49 @@ def measure(options: Any) -> Iterator[Row]:
                 sent(made),
             )
             if budget is not None:
-                yield grid_row(name, channel, train, made.nbytes, points, values)
+                yield from grid_rows(name, channel, train, made.nbytes, points, values)
         given = known_points(train, channel)
-        value, known, n = grid(*given, CELL[name], points)
-        n_bytes = n * (PLACE_BYTES + VALUE_BYTES[channel])
+        value, known, n, n_bytes = grid(*given, CELL[name], points)
         about = f"grid of {CELL[name]:g} m, {n:,} cells"
         yield name, about, n_bytes / 1e3, score(channel, value, values), share(known), None, None, None
+        if channel == "colour":
+            value, values, known = neighbours(scans)
+            about = "frames before and after"
+            yield name, about, None, score(channel, value, values), share(known), None, None, None
 
 
 def share(known: Tensor) -> float:
     return 100 * float(known.double().mean())
 
 
-def grid_row(
+def grid_rows(
     name: str, channel: str, train: Sequence[Scan], n_bytes: int, points: Tensor, values: Tensor
-) -> Row:
-    """The finest grid that takes at most so many bytes."""
-    side, given = CELL[name], known_points(train, channel)
-    while True:
-        value, known, n = grid(*given, side, points)
-        taken = n * (PLACE_BYTES + VALUE_BYTES[channel])
-        if taken <= n_bytes:
-            about = f"grid of {side:.3f} m, {n:,} cells"
-            return name, about, taken / 1e3, score(channel, value, values), share(known), None, None, None
-        side *= max(1.01, (taken / n_bytes) ** 0.4)
+) -> Iterator[Row]:
+    """The finest grid, and the finest octree, that take at most so many bytes."""
+    given = known_points(train, channel)
+    for kind, step in (("grid", 0), ("octree", STEP))[: 1 if channel == "class" else 2]:
+        side = CELL[name] / 2
+        while True:
+            value, known, n, taken = grid(*given, side, points, step)
+            if taken <= n_bytes:
+                break
+            side *= max(1.01, (taken / n_bytes) ** 0.4)
+        about = f"{kind} of {side:.3f} m, {n:,} cells"
+        yield name, about, taken / 1e3, score(channel, value, values), share(known), None, None, None
+
+
+def neighbours(scans: Sequence[Scan]) -> tuple[Tensor, Tensor, Tensor]:
+    """Colours by the nearest points of the frames beside held-out ones, true ones, and which are known."""
+    found, true, known = [], [], []
+    for i in range(EVERY, len(scans) - 1, EVERY):
+        points, values = known_points(scans[i : i + 1], "colour")
+        near, given = known_points([scans[i - 1], scans[i + 1]], "colour")
+        distance, rows = cKDTree(near.numpy()).query(points.numpy(), 8, distance_upper_bound=0.03)
+        seen = torch.from_numpy(np.isfinite(distance[:, -1]))
+        found.append(given[torch.from_numpy(rows)[seen]].double().mean(1))
+        true.append(values[seen])
+        known.append(seen)
+    return torch.cat(found), torch.cat(true), torch.cat(known)
 
 
 COLUMNS = {"data": "", "from": "", "kB": ",.1f", "result": "", "known (%)": ".1f", "AUC": ".4f", "CPU s": ""}

@@ -1,5 +1,7 @@
 """What a picture of the live view costs: bytes to a browser and processor time, by the size of the map.
 
+Between the last two pictures the map grows by a twentieth; before, all of its components change.
+
 python benchmarks/live_view.py
 """
 
@@ -7,7 +9,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from live.viser_client import Client, wait_until
 
 from gmmtorch.live.live_view import LiveView, Moment, ViewedRobot
+from gmmtorch.live.viewer_scene import parts, surfaces
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.team.exploration.mission.robot_view import camera_rotation
@@ -27,20 +31,27 @@ from gmmtorch.team.exploration.mission.robot_view import camera_rotation
 _OFFERS = 1_000_000
 
 
-def pictures(view: LiveView, shown: GaussianMap) -> tuple[int, float]:
-    """Bytes of a picture to one browser, and seconds of the processor; the third picture counts."""
+def pictures(view: LiveView, maps: Sequence[GaussianMap]) -> tuple[list[int], float]:
+    """Bytes of each picture of maps to one browser, and seconds of the processor of the last one."""
     path = torch.rand(200, 3, dtype=torch.float64) * 5
     robots = [ViewedRobot(n, path + n, camera_rotation(0.3), (1.5, 1.0), path[:10]) for n in range(3)]
     with Client(view.url) as client:
         wait_until(lambda: view.viewer.n_viewers == 1)
-        for k in range(3):
+        sent = []
+        for k, shown in enumerate(maps):
             times = [float(t) for t in range(100 + k)]
             begin = time.process_time()
-            view.finish(lambda t=times: Moment(shown, robots, t, {"entropy": {"team": t}}))
+            view.finish(lambda t=times, m=shown: Moment(m, robots, t, {"entropy": {"team": t}}))
             seconds = time.process_time() - begin
-            n_bytes = client.received(b"/slice", b"/robots/2-ahead")
-            time.sleep(0.5)
-    return n_bytes, seconds
+            sent.append(client.received(_last_part(shown), b"/robots/2-ahead"))
+            time.sleep(1)
+    return sent, seconds
+
+
+def _last_part(shown: GaussianMap) -> bytes:
+    """The name of the part that a picture sends last."""
+    components = shown.components()
+    return f"/{list(parts(components, surfaces(components)))[-1]}".encode()
 
 
 def offer(view: LiveView) -> None:
@@ -56,9 +67,12 @@ def measure(options: Any) -> Iterator[Row]:
     for n in (300, 1000, 3000, 10_000):
         means = torch.rand(n, 3, generator=generator, dtype=torch.float64) * torch.tensor([20.0, 15.0, 3.0])
         axes = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64) * 0.08
-        shown = GaussianMap.of(_components(means, axes @ axes.mT + 1e-4 * torch.eye(3)))
-        n_bytes, seconds = pictures(view, shown)
-        yield n, n_bytes / 1e3, 1e3 * seconds
+        whole = _components(means, axes @ axes.mT + 1e-4 * torch.eye(3))
+        most = torch.arange(round(0.95 * n))
+        other = replace(whole, means=means + 0.01).selected(most)
+        maps = [GaussianMap.of(part) for part in (other, whole.selected(most), whole)]
+        (_, changed, grown), seconds = pictures(view, maps)
+        yield n, changed / 1e3, grown / 1e3, 1e3 * seconds
     view.stop()
 
 
@@ -72,7 +86,8 @@ def _components(means: torch.Tensor, covariances: torch.Tensor) -> Components:
     )  # fmt: skip
 
 
-FORMATS = {"components": ",.0f", "to each browser": "{:.0f} kB", "processor, drawing": "{:.0f} ms"}
+FORMATS = {"components": ",.0f", "all changed": "{:.0f} kB", "grown by 5 %": "{:.0f} kB"}
+FORMATS |= {"processor, drawing": "{:.0f} ms"}
 CASE = Case("live-view", measure, "CPU time of all threads; one browser.", FORMATS, needs_data=False)
 
 if __name__ == "__main__":

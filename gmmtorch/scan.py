@@ -130,14 +130,18 @@ def _as_channel(name: str, given: ArrayLike, points: Tensor) -> Tensor:
             )
         return value
     value = value[:, None] if value.ndim == 1 else value
-    if not 1 <= value.shape[1] <= MOST_COLUMNS or bool((value.abs() > LARGEST_VALUE).any()):
+    if not 1 <= value.shape[1] <= MOST_COLUMNS:
         raise InvalidArgumentError(
-            f"{where} has {value.shape[1]} columns, or values beyond {LARGEST_VALUE:g}; give 1 to "
-            f"{MOST_COLUMNS} columns of numbers in another unit, and NaN where unknown."
+            f"{where} has {value.shape[1]} columns; give 1 to {MOST_COLUMNS}, in several channels if need be."
         )
     if is_colour and bool(((value < 0) | (value > 1)).any()):
         raise InvalidArgumentError(
             f"{where} has values outside 0 to 1; give linear RGB, or sRGB from 0 to 255 as uint8."
+        )
+    if bool((value.abs() > LARGEST_VALUE).any()):
+        raise InvalidArgumentError(
+            f"{where} has values beyond {LARGEST_VALUE:g}, or infinite ones; give them in another unit, and "
+            "NaN where unknown."
         )
     return value
 
@@ -180,7 +184,12 @@ class Scan:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "origin", origin.to(points.device))
         object.__setattr__(self, "no_return", no_return.to(points.device, points.dtype))
-        channels = {name: _as_channel(name, x, points) for name, x in (self.attributes or {}).items()}
+        given = {} if self.attributes is None else self.attributes
+        if not isinstance(given, Mapping):
+            raise InvalidArgumentError(
+                f'attributes is a {type(given).__name__}; name each channel, as in {{"colour": values}}.'
+            )
+        channels = {name: _as_channel(name, x, points) for name, x in given.items()}
         if len(channels) > MOST_CHANNELS:
             raise InvalidArgumentError(
                 f"attributes has {len(channels)} channels; give at most {MOST_CHANNELS}."

@@ -35,6 +35,7 @@ _GREY = 0.6
 _HARMONIC = 0.28209479177387814  # √(1/4π), of degree 0
 _MOST_SPLATS, _MOST_BYTES = 1 << 24, 1 << 30
 _FARTHEST_EXACT = 2e-3 * 2**23  # m, where 24 bits with a sign have steps of 2 mm
+_REACH = 10.0  # deviations: the farthest that a splat is seen from as a component
 _THINNEST = 1e-3  # m, least deviation of a splat that becomes a component
 _POINTS = 1e4  # for each m² of a splat that becomes a component: one for each square centimetre
 _Y_UP = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
@@ -200,6 +201,7 @@ def read_splats(path: str | Path) -> Splats:
             )
     try:
         check_positions("means", found.means)
+        check_positions("extent", found.means.abs() + _REACH * found.deviations)
     except InvalidArgumentError as error:
         raise DataError(f"{path}: {error}") from error
     return found
@@ -309,7 +311,7 @@ def map_of_splats(splats: Splats, least_opacity: float = 0.1) -> GaussianMap:
         means,
         scaled @ scaled.mT,
         (2 * math.pi * _POINTS * middle * long * opacity).clamp_min(1.0),
-        means + 2 * torch.maximum(long, 5 * short)[:, None] * toward,
+        means + torch.maximum(2 * long, _REACH * short)[:, None] * toward,
         None,
         0,
     )

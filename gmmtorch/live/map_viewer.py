@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import ipaddress
 import math
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -79,6 +80,7 @@ class MapViewer:
             self.server: Any = viser.ViserServer(host, port, label="gmmtorch", verbose=False)
         self._lock = threading.RLock()
         self._nodes: dict[str, Any] = {}
+        self._sent: dict[str, tuple[str, bytes]] = {}  # shape and digest of each part of the components
         self.shift = torch.zeros(3, dtype=torch.float64)
         self._view: viewer_scene.Frame | None = None
         self._map, self._components = shown, Components.empty(3)
@@ -142,6 +144,7 @@ class MapViewer:
             self._fit(viewer_scene.frame_of(centres, self._paths), flat=False)
             shades = viewer_scene.height_shades(centres)
             moved = (centres - self.shift).numpy()
+            self._remove_parts(keep=("components",))
             self._nodes["components"] = viewer_scene.add_cells(self.server.scene, moved, side, shades)
             self._draw_paths()
 
@@ -204,7 +207,7 @@ class MapViewer:
         solid = viewer_scene.surfaces(self._components, below, self._unsure.value / 100)
         shape = self._shape.value
         if shape == "none" or len(solid.rows) == 0:
-            self._remove("components")
+            self._remove_parts()
             return
         colours = viewer_scene.colours(self._components, solid, self._colour.value)
         self._legend.content = colours.html
@@ -214,11 +217,30 @@ class MapViewer:
             mesh = surface_mesh(self._components, self._resolution.value)
             if below < math.inf:
                 mesh = mesh.inside((-math.inf,) * 3, (math.inf, math.inf, below))
+            self._remove_parts()
             self._nodes["components"] = viewer_scene.add_mesh(scene, mesh, self.shift)
-        elif shape == "splats":
-            self._nodes["components"] = viewer_scene.add_splats(scene, solid, colours)
-        else:
-            self._nodes["components"] = viewer_scene.add_ellipsoids(scene, solid, colours.rgb)
+            return
+        parts = viewer_scene.parts(self._components, solid)
+        self._remove_parts(keep=parts)
+        is_soft, n_all = shape == "splats", len(solid.rows)
+        arrays = viewer_scene.splats(solid, colours) if is_soft else viewer_scene.ellipsoids(solid, colours)
+        for name, rows in parts.items():
+            part = tuple(values[rows] for values in arrays)
+            content = hashlib.blake2b(b"".join(values.tobytes() for values in part)).digest()
+            if self._sent.get(name) == (shape, content):
+                continue
+            self._sent[name] = shape, content
+            self._nodes[name] = (
+                scene.add_gaussian_splats(f"/{name}", *part)
+                if is_soft
+                else viewer_scene.add_ellipsoids(scene, f"/{name}", part, n_all)
+            )
+
+    def _remove_parts(self, keep: Container[str] = ()) -> None:
+        """Removes what components are drawn as, except the parts with some names."""
+        for name in [name for name in self._nodes if name.startswith("components") and name not in keep]:
+            self._sent.pop(name, None)
+            self._remove(name)
 
     def _draw_paths(self) -> None:
         given = self._path_colours or [_PATH_COLOUR] * len(self._paths)

@@ -48,6 +48,8 @@ _FREE_ALPHA, _OCCUPIED_ALPHA = 90, 240
 _FAR = 1e4  # m from the origin, above which float32 is too coarse and the scene is moved to the origin
 _SLICE_PIXELS = 1000  # along the longer side of a slice
 _UNSURE = 3.0  # cells of the map's resolution: uncertainty of components that are hidden at first
+_SCALE_STEPS = 10  # of a scale of heights, at least, to which its ends are rounded
+_PART = 256  # components, numbered one after the other, that are sent together
 _UNDERNEATH = -0.05  # m, height of the slice of a 2D map: below its components
 
 
@@ -145,7 +147,7 @@ def colours(components: Components, solid: Solid, by: str) -> Colours:
     """The colours of the components by one of `colour_choices`."""
     check_choice("colour", by, colour_choices(components))
     if by == "height":
-        scale = height_scale(solid.means[:, 2])
+        scale = _steady_scale(solid.means[:, 2])
         deviations, axes = principal_axes(solid.covariances)
         change = axes[:, 2] * deviations
         above, below = (
@@ -205,7 +207,17 @@ def _spread(value: Tensor, low: float, high: float) -> np.ndarray:
 
 def height_shades(places: Tensor) -> np.ndarray:
     """Colours (K, 3) uint8 of the heights of places (K, 3), metres."""
-    return _shades(np.asarray(height_scale(places[:, 2])(places[:, 2].numpy())))
+    return _shades(np.asarray(_steady_scale(places[:, 2])(places[:, 2].numpy())))
+
+
+def _steady_scale(heights: Tensor) -> Any:
+    """The colour scale of heights (N,), metres, whose ends are rounded, so that a map that grows a little
+    keeps its colours."""
+    scale: Any = height_scale(heights)
+    low, high = scale.vmin, scale.vmax
+    step = 2.0 ** math.floor(math.log2((high - low) / _SCALE_STEPS))
+    scale.vmin, scale.vmax = step * math.floor(low / step), step * math.ceil(high / step)
+    return scale
 
 
 def colour_scale() -> list[str]:
@@ -360,26 +372,46 @@ def add_lights(scene: Any, distance: float) -> None:
         )
 
 
-def add_ellipsoids(scene: Any, solid: Solid, colours: np.ndarray) -> Any:
-    """Components in the scene's frame as 2σ ellipsoids with colours (K, 3) uint8."""
-    wxyz, positions, scales = (part.astype(np.float32) for part in instances(solid))
-    vertices, faces = unit_sphere(next(n for most, n in _SPHERES if len(colours) <= most))
+def parts(components: Components, solid: Solid) -> dict[str, np.ndarray]:
+    """The rows of `solid` in parts of components that a robot learned together, by name."""
+    ids = components.ids.cpu()[solid.rows]
+    keys = torch.stack([ids[:, 0], ids[:, 1] // _PART], 1)
+    found, number = torch.unique(keys, dim=0, return_inverse=True)
+    rows = torch.argsort(number, stable=True).split(torch.bincount(number).tolist())
+    return {
+        "components/{}-{}".format(*key): part.numpy() for key, part in zip(found.tolist(), rows, strict=True)
+    }
+
+
+Arrays = tuple[np.ndarray, ...]
+"""Of each component that is drawn."""
+
+
+def ellipsoids(solid: Solid, colours: Colours) -> Arrays:
+    """What `add_ellipsoids` draws: quaternions, places and scales of 2σ ellipsoids, and their colours."""
+    return (*(part.astype(np.float32) for part in instances(solid)), colours.rgb)
+
+
+def add_ellipsoids(scene: Any, name: str, arrays: Arrays, n_all: int) -> Any:
+    """Components in the scene's frame as ellipsoids; n_all: the number of all of them."""
+    wxyz, positions, scales, rgb = arrays
+    vertices, faces = unit_sphere(next(n for most, n in _SPHERES if n_all <= most))
     return scene.add_batched_meshes_simple(
-        "/components",
+        name,
         vertices.float().numpy(),
         faces.numpy().astype(np.uint32),
         wxyz,
         positions,
         batched_scales=scales,
-        batched_colors=colours,
+        batched_colors=rgb,
         lod="off",
         **_UNSHADED,
     )
 
 
-def add_splats(scene: Any, solid: Solid, colours: Colours) -> Any:
-    """Components in the scene's frame as Gaussian splats. Light falls on them, except on colours of a camera,
-    which have the light of the place."""
+def splats(solid: Solid, colours: Colours) -> Arrays:
+    """What viser draws as Gaussian splats: places, covariances, colours and opacity. Light falls on them,
+    except on colours of a camera, which have the light of the place."""
     opacity = np.full((len(solid.means), 1), _OPACITY, np.float32)
     means, covariances = solid.means.float().numpy(), _WIDER**2 * solid.covariances.float().numpy()
     shades = colours.rgb
@@ -388,7 +420,7 @@ def add_splats(scene: Any, solid: Solid, colours: Colours) -> Any:
         lamps = torch.nn.functional.normalize(normal.new_tensor(_LAMPS), dim=1)
         light = 0.5 + (normal @ lamps.T).abs() @ normal.new_tensor([0.45, 0.2])
         shades = (shades * light.clamp_max(1)[:, None].numpy()).astype(np.uint8)
-    return scene.add_gaussian_splats("/components", means, covariances, shades, opacity)
+    return means, covariances, shades, opacity
 
 
 def add_mesh(scene: Any, mesh: TriangleMesh, shift: Tensor) -> Any:

@@ -225,6 +225,11 @@ def test_splats_that_are_not_finite_are_refused(tmp_path, name):
         read_splats(changed_ply(tmp_path, name, np.nan))
 
 
+def test_a_splat_larger_than_the_earth_is_refused_by_the_reader(tmp_path):
+    with pytest.raises(DataError, match=r"a\.ply: extent\[1\]"):
+        read_splats(changed_ply(tmp_path, "scale_1", 40.0))
+
+
 def test_zero_scales_zero_rotations_and_extreme_logits_are_read(tmp_path):
     for name, value in (("scale_0", -np.inf), ("opacity", 500.0), ("opacity", -np.inf)):
         found = read_splats(changed_ply(tmp_path, name, value))

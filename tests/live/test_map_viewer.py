@@ -218,21 +218,27 @@ def test_a_place_has_the_evidence_from_which_its_occupancy_follows(dim, maps):
 # -- the page -------------------------------------------------------------------------------------
 
 
+def n_drawn(viewer: MapViewer) -> int:
+    """Number of ellipsoids in the scene."""
+    parts = (node for name, node in viewer._nodes.items() if name.startswith("components/"))
+    return sum(len(node.batched_positions) for node in parts)
+
+
 def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, maps):
-    assert {"components", "paths/0"} == viewer._nodes.keys()
+    assert {"components", "paths"} == {name.partition("/")[0] for name in viewer._nodes}
     viewer._shape.value = "ellipsoids"
     viewer._redraw(viewer._draw_components)
     viewer._visible.value, viewer._height.value = True, 0.8
     viewer._redraw(viewer._draw_slice)
     assert viewer._nodes["slice"].position[2] == pytest.approx(0.8)
-    n_all = len(viewer._nodes["components"].batched_positions)
+    n_all = n_drawn(viewer)
     viewer._cut.value = 1.0
     viewer._redraw(viewer._draw_components)
-    n_below = len(viewer._nodes["components"].batched_positions)
+    n_below = n_drawn(viewer)
     assert 0 < n_below < n_all
     viewer._unsure.value = 50
     viewer._redraw(viewer._draw_components)
-    assert 0 < len(viewer._nodes["components"].batched_positions) < n_below
+    assert 0 < n_drawn(viewer) < n_below
     assert "linear-gradient" in viewer._legend.content
     viewer._show_place((2.0, 2.0, 0.81), (0.0, 0.0, -1.0))
     theta = maps[3][0].occupancy(np.array([[2.0, 2.0, 0.8]]), 0.1)[0]
@@ -247,7 +253,8 @@ def test_controls_change_the_scene_and_a_click_says_what_the_map_knows(viewer, m
 def test_other_shapes(shape, viewer):
     viewer._shape.value = shape
     viewer._redraw(viewer._draw_components)
-    assert ("components" in viewer._nodes) == (shape != "none")
+    assert any(name.startswith("components") for name in viewer._nodes) == (shape != "none")
+    assert ("components" in viewer._nodes) == (shape == "surfaces")
 
 
 def test_html_is_one_file_without_references_to_a_network(viewer, tmp_path):
@@ -263,10 +270,28 @@ def test_a_growing_map_is_shown_from_its_first_components(maps):
         assert not made._nodes
         assert len(set(made._colour.options)) == len(made._colour.options)  # or the page stays blank
         made.update(*maps[2])
-        assert {"components", "paths/0", "slice"} <= made._nodes.keys()
+        assert {"components", "paths", "slice"} <= {name.partition("/")[0] for name in made._nodes}
         assert not made._height.visible
     finally:
         made.stop()
+
+
+def test_only_parts_with_changed_components_are_sent_again(viewer, maps):
+    own = maps[3][0].components()
+    rows = torch.arange(4 * len(own)) % len(own)
+    ids = torch.stack([torch.zeros_like(rows), torch.arange(len(rows))], 1)
+    many = replace(own.selected(rows), ids=ids)
+    viewer.update(GaussianMap.of(many))
+    before = {name: node for name, node in viewer._nodes.items() if name.startswith("components")}
+    surface = viewer_scene.surfaces(many).rows
+    assert len(before) == len(torch.unique(surface // 256)) > 2
+    means = many.means.clone()
+    means[surface[0]] += 0.01
+    viewer.update(GaussianMap.of(replace(many, means=means)))
+    changed = [name for name, node in before.items() if viewer._nodes[name] is not node]
+    assert changed == [f"components/0-{int(surface[0]) // 256}"]
+    viewer.update(GaussianMap.of(many.selected(torch.arange(256))))
+    assert [name for name in viewer._nodes if name in before] == ["components/0-0"]
 
 
 # -- who may see the page -------------------------------------------------------------------------

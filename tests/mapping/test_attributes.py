@@ -415,6 +415,12 @@ def test_bad_channels_are_refused_with_the_remedy(name, value, reason):
         scan_of(**{name: value})
 
 
+@pytest.mark.parametrize("value", [torch.zeros(2, 3), [torch.zeros(2)]])
+def test_channels_without_names_are_refused(value):
+    with pytest.raises(InvalidArgumentError, match="name each channel"):
+        Scan(torch.zeros(2, 3), torch.ones(3), attributes=value)
+
+
 def test_a_change_of_attributes_alone_counts():
     made = painted_map(5, 3)
     made.revise(lambda c: c)
