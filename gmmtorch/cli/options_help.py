@@ -71,6 +71,7 @@ _REPLACED = {
     "runtime.cache": "results that depend only on the world are always stored.",
     "stream.checkpoint_seconds": "use checkpoint_seconds.",
     "stream.checkpoint_every": "use checkpoint_seconds; else every ten iterations have one.",
+    "stream.max_range": "use dataset.max_range.",
     "stream.sample_points": "the start of EM and PSNR2 take 100,000 points.",
     "stream.timeout": "processes wait for each other for ten minutes.",
     "codec": _CONSTANT
@@ -96,7 +97,7 @@ _REPLACED_GROUPS = (
     ("belief.", "prior clamp free occupied", _CONSTANT % "`BeliefRule`"),
     (
         "map.",
-        "cell iterations length max_cells max_cost n_samples max_origins mean_origins planarity "
+        "cell iterations length max_cells max_cost max_origins mean_origins planarity "
         "min_density_share min_points min_support sampling window_components components distance "
         "distance_for hits_per_ray novelty_block "
         "observed rays shell threshold update_at update_every update_novel update_stride prune learner "

@@ -30,7 +30,7 @@ class QueryOptions:
         "the thesis (3.9)",
     )
     cutoff: float | None = None
-    n_samples: int = 1_000_000
+    n_samples: int = option(1_000_000, "Monte Carlo rays, drawn from the whole map")
     sampling: Sampling = "sobol"
     random_state: int = 0
     memory_limit: int = 4 << 30
