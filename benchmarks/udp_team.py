@@ -115,7 +115,7 @@ def _start(
         f"team.size={options.robots}",
         "source=log",
         f"dataset@log.dataset={options.dataset}",
-        f"log.rate={options.rate}",
+        f"sensor.rate={options.rate}",
         f"settle={options.settle}",
         f"seed={seed}",
         f"network.loss={options.loss}",

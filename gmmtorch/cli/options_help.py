@@ -61,9 +61,17 @@ _REPLACED = {
     "sensor.camera_info": "the nearest topic by name is used; sensor.intrinsics=[fx,fy,cx,cy] replaces it.",
     "link.scouting": "set scouting in the file of link.zenoh_config.",
     "link.ttl": "robots of a multicast group share one network.",
+    "log.rate": "use sensor.rate.",
+    "log.start": "use start.",
+    "rate": "use speed.",
+    "report.magnify": "use report.detail=true.",
+    "report.scene": "use report.detail=true.",
+    "runtime.workers": "use workers.",
+    "study.n_seeds": "use study.seeds, as in [0,1,2].",
     "runtime.cache": "results that depend only on the world are always stored.",
     "stream.checkpoint_seconds": "use checkpoint_seconds.",
     "stream.checkpoint_every": "use checkpoint_seconds; else every ten iterations have one.",
+    "stream.max_range": "use dataset.max_range.",
     "stream.sample_points": "the start of EM and PSNR2 take 100,000 points.",
     "stream.timeout": "processes wait for each other for ten minutes.",
     "codec": _CONSTANT
@@ -89,8 +97,9 @@ _REPLACED_GROUPS = (
     ("belief.", "prior clamp free occupied", _CONSTANT % "`BeliefRule`"),
     (
         "map.",
-        "cell iterations length max_cells max_origins mean_origins planarity min_density_share min_points "
-        "min_support sampling window_components components distance distance_for hits_per_ray novelty_block "
+        "cell iterations length max_cells max_cost max_origins mean_origins planarity "
+        "min_density_share min_points min_support sampling window_components components distance "
+        "distance_for hits_per_ray novelty_block "
         "observed rays shell threshold update_at update_every update_novel update_stride prune learner "
         "free_points",
         _CONSTANT % "a field of the learning rule, of `QueryOptions` or of `FrameRule`; a study may vary it",
@@ -114,7 +123,7 @@ _REPLACED_GROUPS = (
         "study.",
         "bandwidths bgk_points dims forms init_params max_beams max_iter max_origins method methods "
         "multiples n_cells n_large_samples n_neighbors n_pixels n_points n_rays n_samples n_scans noise "
-        "others prior railing_scans resolution sensor support test_every thin_width tol "
+        "others prior railing_scans resolution sensor sensor_options support test_every thin_width tol "
         "tolerance variance_threshold window window_components",
         _CONSTANT % "the class of the study has it",
     ),

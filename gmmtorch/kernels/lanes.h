@@ -6,6 +6,8 @@
 
 #if defined(__clang__) && !defined(__CUDA_ARCH__)
 #define GMM_VECTORS  // the compiler has vectors
+// Without AVX-512 it warns that vectors as arguments are no ABI; a kernel calls only its own functions.
+#pragma clang diagnostic ignored "-Wpsabi"
 #endif
 
 namespace gmm {

@@ -23,7 +23,7 @@ from live.viser_client import Client, wait_until
 
 from gmmtorch.live.live_view import LiveView, Moment
 
-LOG = ["source=log", "dataset@log.dataset=synthetic_building_2d", "log.dataset.n_scans=4", "log.rate=20"]
+LOG = ["source=log", "dataset@log.dataset=synthetic_building_2d", "log.dataset.n_scans=4", "sensor.rate=20"]
 LOG += ["log.map={window: 2}", "settle=0.2", "team.size=2"]
 
 

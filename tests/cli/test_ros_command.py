@@ -96,7 +96,7 @@ def test_ctrl_c_saves_the_map_of_a_played_recording(monkeypatch, tmp_path, ros_o
             bag.laser("/scan", i / 10, "laser", [2.0 + k / 50 for k in range(60)], -1.5, 0.05, 9.0)
 
     def play_and_stop() -> None:
-        options = [*on_network, "rate=4", "wait=60", f"play={tmp_path / 'a.mcap'}"]
+        options = [*on_network, "speed=4", "wait=60", f"play={tmp_path / 'a.mcap'}"]
         played.append(run_script("ros", tmp_path / "play", *options, "report.progress=false"))
         end = time.monotonic() + 60
         while not any(count["received"] == 20 for count in counts()) and time.monotonic() < end:

@@ -85,7 +85,7 @@ def test_a_team_holds_the_map_of_one_replica_with_all_records(tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_a_team_replays_a_log_and_all_robots_end_with_all_records(run):
-    options = ["log.rate=20", "settle=8", "network.announce=0.3", "network.loss=0.2"]
+    options = ["sensor.rate=20", "settle=8", "network.announce=0.3", "network.loss=0.2"]
     done = succeeded(run(*LOG, *options))
     summary, *rows = done.results()["rows"]
     assert summary["same_map"] is True

@@ -19,7 +19,7 @@ from gmmtorch.mixture.em.initialization import INITIALIZATIONS
 from gmmtorch.report import ignore
 
 EM = FitOptions(max_iter=20, algorithm="exact")
-SMALL = InitializationStudy(n_components=(2, 5), init_params=("random_points", "kmeans"), n_seeds=2)
+SMALL = InitializationStudy(n_components=(2, 5), init_params=("random_points", "kmeans"), seeds=(7, 8))
 
 
 @pytest.fixture
@@ -28,12 +28,12 @@ def data(generator) -> FitData:
     return split("slab", points + 500.0, 0.5, 0)
 
 
-def rows_of(data: FitData, study: InitializationStudy = SMALL, seed: int = 0) -> list[Row]:
-    return run_initialization(data, study, EM, seed, ignore, lambda rows: None)
+def rows_of(data: FitData, study: InitializationStudy = SMALL) -> list[Row]:
+    return run_initialization(data, study, EM, ignore, lambda rows: None)
 
 
 def test_a_row_for_each_initialization_number_and_seed(data):
-    rows = rows_of(data, seed=7)
+    rows = rows_of(data)
     cases = [(row["seed"], row["n_components"], row["init_params"]) for row in rows]
     assert cases == [(s, k, i) for s in (7, 8) for k in (2, 5) for i in ("random_points", "kmeans")]
     for row in rows:
@@ -44,7 +44,7 @@ def test_a_row_for_each_initialization_number_and_seed(data):
 
 
 def test_starts_of_means_run_with_each_initial_covariance(data):
-    study = replace(SMALL, initial_covariance=("tiles", "box"), n_components=(3,), n_seeds=1)
+    study = replace(SMALL, initial_covariance=("tiles", "box"), n_components=(3,), seeds=(0,))
     rows = rows_of(data, study)
     found = [(row["start"], row["init_params"], row["initial_covariance"]) for row in rows]
     assert found == [
@@ -77,16 +77,16 @@ def test_a_timed_fit_matches_the_estimator(init_params, data):
         assert ours[name] == expected, name
 
 
-def test_rows_depend_only_on_the_seed(data):
+def test_rows_depend_only_on_the_seeds(data):
     assert timeless(rows_of(data)) == timeless(rows_of(data))
-    assert timeless(rows_of(data)) != timeless(rows_of(data, seed=1))
+    assert timeless(rows_of(data)) != timeless(rows_of(data, replace(SMALL, seeds=(8, 7))))
 
 
 def test_rows_are_reported_one_by_one_and_progress_is_complete(data):
     seen: list[int] = []
     events: list[tuple[str, int, int | None]] = []
     run_initialization(
-        data, SMALL, EM, 0, lambda *event: events.append(event), lambda rows: seen.append(len(rows))
+        data, SMALL, EM, lambda *event: events.append(event), lambda rows: seen.append(len(rows))
     )
     assert seen == list(range(1, 9))
     assert events == [("starts", done, 8) for done in range(9)]
@@ -95,7 +95,8 @@ def test_rows_are_reported_one_by_one_and_progress_is_complete(data):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_seeds": 0}, "n_seeds=0"),
+        ({"seeds": ()}, r"seeds=\[\] is empty"),
+        ({"seeds": (-1,)}, "seeds=-1"),
         ({"n_components": ()}, r"n_components=\[\] is empty"),
         ({"initial_covariance": ("sphere",)}, "initial_covariance='sphere'"),
         ({"n_components": (2, 400)}, "n_components=400 is more than the n_samples=300"),

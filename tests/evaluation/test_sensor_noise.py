@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from evaluation.pillar_room import room_scan
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
@@ -16,17 +15,16 @@ from scipy.stats import multivariate_normal
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import queries
-from gmmtorch.experiments.studies.sensor_noise import SENSORS, VARIANTS, run_sensor_noise, sensor_model
+from gmmtorch.experiments.studies.sensor_noise import VARIANTS, run_sensor_noise
 from gmmtorch.experiments.studies.study_options import SensorModelStudy
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.estimators.sensor_model import LaserModel, LidarModel
+from gmmtorch.mixture.estimators.sensor_model import LaserModel
 from gmmtorch.scan import Scan
 
 NOISE = 0.04
 SENSOR = LaserModel(noise=NOISE, divergence=1e-4)
 STUDY = SensorModelStudy(
-    "laser_2d",
-    {"noise": NOISE, "divergence": 1e-4},
+    SENSOR,
     (6, 20),
     n_points=1500,
     test_every=5,
@@ -119,8 +117,8 @@ def test_planar_components_are_at_most_as_thick_as_the_noise(rows):
 
 
 def test_a_sensor_without_noise_gives_the_plain_mixture(scans):
-    exact = {"noise": 1e-9, "divergence": 1e-9}
-    study = replace(SMALL, sensor_options=exact, n_components=(10,), n_points=600, max_iter=10)
+    exact = LaserModel(noise=1e-9, divergence=1e-9)
+    study = replace(SMALL, sensor=exact, n_components=(10,), n_points=600, max_iter=10)
     plain, _, noise, _ = run_sensor_noise("room", scans, study)
     for name in ("held_out_log_likelihood", "auc", "thickness"):
         assert noise[name] == pytest.approx(plain[name], rel=1e-5)
@@ -150,25 +148,13 @@ def test_scans_without_points_raise(scans):
         run_sensor_noise("room", empty, STUDY)
 
 
-def test_sensor_models_are_found_by_name():
-    for name in SENSORS:
-        model = sensor_model(SensorModelStudy(name))
-        assert model.noise_covariances(torch.ones(1, 2), torch.zeros(2)).shape == (1, 2, 2), name
-    assert sensor_model(STUDY) == SENSOR
-    assert sensor_model(SensorModelStudy()) == LidarModel()
-    with pytest.raises(InvalidArgumentError, match="sensor='sonar' is not one of"):
-        sensor_model(SensorModelStudy("sonar"))
-    with pytest.raises(InvalidArgumentError, match="divergenz is not an option of lidar; known are"):
-        sensor_model(SensorModelStudy("lidar", {"divergenz": 1}))
-
-
 @pytest.mark.real_data
 @pytest.mark.slow
 def test_the_noise_model_improves_likelihood_on_real_scans(real_data: Path):
     path = real_data / "laser2d" / "intel.log.gz"
     if not path.is_file():
         pytest.skip(f"{path} is not there")
-    study = SensorModelStudy("laser_2d", n_components=(200,), n_points=8000, max_beams=2000, max_iter=15)
+    study = SensorModelStudy(LaserModel(), n_components=(200,), n_points=8000, max_beams=2000, max_iter=15)
     scans, thinner = list(load("carmen", path, stride=4)), 0.0
     for seed in range(3):
         plain, _, noise, _ = run_sensor_noise("intel", scans, study, seed)

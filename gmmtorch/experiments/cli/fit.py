@@ -48,7 +48,9 @@ class FitCommand:
     )
     study: Any = option(None, "a study with rows of its own, which an experiment sets")
     points: str | None = option(
-        None, "file (.npy, .las, .laz, .pcd, .ply) that is read in chunks, instead of a data set"
+        None,
+        "file (.npy, .las, .laz, .pcd, .ply) that is read in chunks, instead of a data set; points at "
+        "dataset.max_range from the frame's origin or beyond are dropped",
     )
     checkpoint: str | None = option(None, "file for the state of the fit; null: none")
     checkpoint_seconds: float | None = option(
@@ -56,11 +58,6 @@ class FitCommand:
     )
     resume: bool = option(False, "continue from the checkpoint if it exists; its folder must exist")
     chunk_points: int = option(1 << 17, "points of a chunk, which limits the memory", "stream.chunk_points")
-    max_range: float | None = option(
-        None,
-        "points at this distance (m) from the frame's origin or beyond are dropped; null: none",
-        "stream.max_range",
-    )
     mixture: FitOptions = group(FitOptions)
     report: cli.Report = group(cli.Report)
     runtime: cli.Runtime = group(cli.Runtime)

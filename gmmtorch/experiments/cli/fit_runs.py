@@ -181,15 +181,16 @@ def _sources(
     config: DictConfig, device: str, on_event: Event
 ) -> tuple[tuple[PointChunks, PointChunks], int | None]:
     """Training and test sources, and how many points are sampled from each; None: all."""
-    stream = config.stream
     if config.points is None:
         data = fit_data(config, device, on_event)
         train, test = (
-            in_memory(points, data.dataset, chunk_points=stream.chunk_points)
+            in_memory(points, data.dataset, chunk_points=config.stream.chunk_points)
             for points in (data.train, data.test)
         )
         return (train, test), None
-    source = open_points(config.points, chunk_points=stream.chunk_points, max_range=stream.max_range)
+    source = open_points(
+        config.points, chunk_points=config.stream.chunk_points, max_range=config.dataset.max_range
+    )
     return evaluation.split_source(source, config.test_share, config.seed), SAMPLE_POINTS
 
 

@@ -24,10 +24,11 @@ TABLE = (
 class OccupancyReport(cli.Report):
     """Figures of gmmtorch-occupancy."""
 
-    magnify: int = option(
-        0, "number of regions of a 2D map with a magnified figure; those with most surface are chosen"
+    detail: bool = option(
+        False,
+        "also magnify the two regions of a 2D map with most surface, and draw 3D maps in space, next to the "
+        "points and the components",
     )
-    scene: bool = option(False, "draw 3D maps in space, next to the points and the components")
 
 
 @dataclass

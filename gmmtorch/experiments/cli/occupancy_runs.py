@@ -12,12 +12,15 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from gmmtorch import cli, report
-from gmmtorch.errors import InvalidArgumentError, check_whole
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments import evaluation
 from gmmtorch.experiments.evaluation import OCCUPIED, Built, MapFactory, Outcome, Protocol
 from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.report import Board, Event, Row
 from gmmtorch.scan import Scan
+
+_N_REGIONS = 2
+"""Magnified regions of a 2D map with `report.detail`."""
 
 
 def known_methods(config: DictConfig) -> dict[str, MapFactory]:
@@ -41,7 +44,6 @@ def map_all(
     config: DictConfig, columns: Sequence[str], device: str, folder: Path, on_event: Event
 ) -> list[Row]:
     """A row for each method, share kept and resolution."""
-    check_whole("report.magnify", config.report.magnify, 0)
     factories = evaluation.choose(list(config.method), known_methods(config))
     protocol = cli.build(Protocol, config, "evaluation")
     check_factories(factories, protocol.resolution[0])
@@ -72,6 +74,7 @@ def draw(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Pa
 
 def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dict[str, Any]:
     """The figures of a run by file name."""
+    detailed = config.report.detail
     trajectory = torch.stack([scan.origin.double().cpu() for scan in scans])
     points = torch.cat([scan.points.double().cpu() for scan in scans])
     low, high = report.robust_bounds(points[:: max(1, len(points) // 200_000)], trajectory)
@@ -81,11 +84,11 @@ def _figures(config: DictConfig, scans: Sequence[Scan], outcome: Outcome) -> dic
         shown = [built for built in outcome.shown if built.row["resolution"] == resolution]
         panels = [report.MapPanel(_label(built), built.answer, resolution, low, high) for built in shown]
         figures[f"map_{resolution:g}m"] = _map_figure(shown)(panels, [trajectory])
-        regions = report.busiest_regions(points, config.report.magnify) if len(low) == 2 else []
+        regions = report.busiest_regions(points, _N_REGIONS) if detailed and len(low) == 2 else []
         for number, (corner, other) in enumerate(regions, 1):
             close = [report.MapPanel(p.title, p.occupancy, resolution, corner, other) for p in panels]
             figures[f"map_{resolution:g}m_region_{number}"] = report.map_figure(close)
-        if config.report.scene and len(low) == 3:
+        if detailed and len(low) == 3:
             figures[f"scene_{resolution:g}m"] = _scene(shown, points, trajectory, surfaces)
         rocs = {_label(built): built.roc for built in shown}
         curves = {name: (r.false_positive, r.true_positive, r.auc) for name, r in rocs.items()}

@@ -111,17 +111,12 @@ def run(command: str, config: DictConfig, device: str, folder: Path, on_event: E
 def _initialization(setting: Setting) -> list[Row]:
     study = setting.study(studies.InitializationStudy)
     data = fit_data(setting.config, setting.device, setting.on_event)
-    return studies.run_initialization(
-        data, study, fit_options(setting.config), setting.seed, *setting.callbacks
-    )
+    return studies.run_initialization(data, study, fit_options(setting.config), *setting.callbacks)
 
 
 def _sensor_model(setting: Setting) -> list[Row]:
     """Fields of a fit that this study does not measure are None."""
     study = setting.study(studies.SensorModelStudy)
-    names = {name: f"study.sensor_options.{name}" for name in study.sensor_options}
-    with cli.naming({**names, **{name: f"study.{name}" for name in ("sensor", "sensor_options")}}):
-        studies.sensor_model(study)  # an invalid option fails before the scans are read
     dataset, scans = selected_scans(setting.config, setting.device, setting.on_event)
     unmeasured = {"log_likelihood": None, "psnr2_db": None}
     return [

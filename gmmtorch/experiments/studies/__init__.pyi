@@ -6,7 +6,6 @@ from .map_studies import evaluate_correction as evaluate_correction
 from .map_studies import run_auc_memory as run_auc_memory
 from .map_studies import run_map_variants as run_map_variants
 from .sensor_noise import run_sensor_noise as run_sensor_noise
-from .sensor_noise import sensor_model as sensor_model
 from .study_options import ApproximationErrorStudy as ApproximationErrorStudy
 from .study_options import AucMemoryStudy as AucMemoryStudy
 from .study_options import ComponentCountStudy as ComponentCountStudy

@@ -60,7 +60,6 @@ def run_initialization(
     data: FitData,
     study: InitializationStudy,
     options: FitOptions,
-    seed: int,
     on_event: Event,
     on_rows: OnRows,
 ) -> list[Row]:
@@ -76,8 +75,8 @@ def run_initialization(
         for covariance in (study.initial_covariance if init in MEANS_ONLY else (None,))
     ]
     cases = [
-        (k, replace(exact, n_components=k, init_params=init), seed + repeat, covariance)
-        for repeat in range(study.n_seeds)
+        (k, replace(exact, n_components=k, init_params=init), seed, covariance)
+        for seed in study.seeds
         for k in study.n_components
         for init, covariance in starts
     ]

@@ -18,14 +18,13 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import fields
 from typing import NamedTuple
 
 import torch
 from sklearn.exceptions import ConvergenceWarning
 from torch import Tensor
 
-from gmmtorch.errors import InvalidArgumentError, check_choice
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import (
     Queries,
     auc_interval,
@@ -38,21 +37,12 @@ from gmmtorch.experiments.studies.study_options import SensorModelStudy
 from gmmtorch.mapping import GaussianMap
 from gmmtorch.mixture import (
     DeconvolvedGaussianMixture,
-    DepthCameraModel,
-    LaserModel,
     LidarModel,
     SensorModel,
     estimate_normals,
 )
 from gmmtorch.report import Event, Row, ignore
 from gmmtorch.scan import Scan
-
-SENSORS: dict[str, type[DepthCameraModel] | type[LidarModel] | type[LaserModel]] = {
-    "depth_camera": DepthCameraModel,
-    "lidar": LidarModel,
-    "laser_2d": LaserModel,
-}
-"""Sensor models by name."""
 
 VARIANTS = ("plain", "planar", "noise", "noise_planar")
 
@@ -63,19 +53,6 @@ class _Cloud(NamedTuple):
     points: Tensor
     noise: Tensor
     scan: Tensor
-
-
-def sensor_model(study: SensorModelStudy) -> SensorModel:
-    """The sensor model that the study names. Raises `InvalidArgumentError` for an unknown name or field."""
-    check_choice("sensor", study.sensor, SENSORS)
-    model = SENSORS[study.sensor]
-    known = {item.name for item in fields(model)}
-    if unknown := set(study.sensor_options) - known:
-        raise InvalidArgumentError(
-            f"sensor_options={study.sensor_options}: {min(unknown)} is not an option of {study.sensor}; "
-            f"known are {', '.join(sorted(known))}."
-        )
-    return model(**study.sensor_options)
 
 
 def run_sensor_noise(
@@ -98,7 +75,7 @@ def run_sensor_noise(
     thickness: median of the components' smallest standard deviations (m); sensor_deviation: median standard
     deviation of the training points along the beam (m).
     """
-    sensor = sensor_model(study)
+    sensor = LidarModel(noise=0.01) if study.sensor is None else study.sensor
     train_index, test_index = split_indices(len(scans), study.test_every)
     train = [scans[i] for i in train_index]
     cloud = _training_cloud(train, sensor, study, seed)

@@ -7,11 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gmmtorch.declarations import option
 from gmmtorch.errors import InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.experiments.evaluation import check_not_empty
+
+if TYPE_CHECKING:
+    from gmmtorch.mixture import SensorModel
+else:
+    SensorModel = Any  # its module loads torch
 
 
 def _check_sizes(n_components: Sequence[int]) -> None:
@@ -111,10 +116,7 @@ class VarianceThresholdStudy:
 
 @dataclass(frozen=True)
 class InitializationStudy:
-    """Of `studies.fit_studies`: a run for each number of components, start and seed.
-
-    The first seed is that of the command.
-    """
+    """Of `studies.fit_studies`: a run for each number of components, start and seed."""
 
     n_components: Sequence[int] = option((4, 8, 32, 64, 128, 256, 512), "numbers of components")
     init_params: Sequence[str] = ("random_points", "bounding_box", "kmeans", "kmeans_restarts", "flat_pieces")
@@ -123,11 +125,12 @@ class InitializationStudy:
         "covariances of random_points and bounding_box. tiles: the mean variance of the cloud, divided by "
         "K^(2/D); box: the square of the bounding box's longest side (thesis 2.1.3)",
     )
-    n_seeds: int = option(3, "number of runs, with the seeds seed, seed + 1, …")
+    seeds: Sequence[int] = option((0, 1, 2), "seeds of the runs")
 
     def __post_init__(self) -> None:
-        check_whole("n_seeds", self.n_seeds, 1)
-        check_not_empty(self, "n_components", "initial_covariance")
+        check_not_empty(self, "n_components", "initial_covariance", "seeds")
+        for seed in self.seeds:
+            check_whole("seeds", seed, 0)
         for name in self.initial_covariance:
             check_choice("initial_covariance", name, ("tiles", "box"))
 
@@ -156,8 +159,7 @@ class ComponentCountStudy:
 class SensorModelStudy:
     """Of `studies.sensor_noise`. The test is as in `Protocol`."""
 
-    sensor: str = "lidar"  # one of `sensor_noise.SENSORS`
-    sensor_options: dict[str, Any] = option({}, "changed options of the sensor model")
+    sensor: SensorModel | None = None  # None: a lidar with noise of 1 cm
     n_components: Sequence[int] = option((50, 200), "sizes K")
     n_points: int = 20_000  # drawn at random from all training scans
     resolution: float = 0.1

@@ -184,9 +184,7 @@ class IncrementalRule(MixtureRule):
     max_bytes: int | None = option(None, "bytes of the map's file, at most; null: no limit")
     max_origins: int = 8
     mean_origins: float | None = 2.0
-    max_cost: float | None = option(
-        None, "squared Hellinger distance up to which components are merged even below the budget"
-    )
+    max_cost: float | None = None
     novelty: NoveltyRule | None = option(
         None,
         "null: learn from all beams; {} or options of NoveltyRule: learn from novel beams only, and count "

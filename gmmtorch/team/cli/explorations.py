@@ -120,7 +120,7 @@ def _status(mission: Mission) -> str:
 def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
     """Runs a study, every variant with every seed; returns its rows."""
     folder = run_dir()
-    check_whole("runtime.workers", config.runtime.workers, 1)
+    check_whole("workers", config.workers, 1)
     variants = from_options.variants_of(config)
     trials = [
         from_options.trial_of(config, folder, variant, seed)
@@ -139,7 +139,7 @@ def compare(config: DictConfig, bars: ProgressBars) -> list[Row]:
         bars.note(STAGE, _status(mission))
 
     with naming(argument_names(TeamOptions)):
-        rows = compared(run_trials(trials, config.runtime.workers, on_row, bars, on_sample))
+        rows = compared(run_trials(trials, config.workers, on_row, bars, on_sample))
     write_results("explore", config, rows, folder)
     save_comparison(config, rows, folder)
     return rows

@@ -41,7 +41,7 @@ class ExploreCommand(team_schema.MissionCommand):
     report: Report = group(Report)
     recording: bool = option(False, "a file for the rerun viewer", "report.recording")
     runtime: Device = group(Device)
-    workers: int = option(2, "missions of an experiment that run in parallel", "runtime.workers")
+    workers: int = option(2, "missions of an experiment that run in parallel")
 
 
 @dataclass

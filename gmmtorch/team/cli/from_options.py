@@ -296,7 +296,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
     store = _opened_store(config, transport, stack)
     scans = open_dataset(config.log.dataset, "log.dataset")
     chosen = list(shard_indices(len(scans), config.id, config.team.size, _PART))
-    is_free = config.log.start == "unknown" and bool(chosen)
+    is_free = config.start == "unknown" and bool(chosen)
     frame = start_frame(scans, chosen[0]) if is_free else None
     replica = _restored(store, config.id, is_free)
     mission = ReplayMission(
@@ -304,7 +304,7 @@ def replaying(config: DictConfig, transport: FramedTransport, stack: ExitStack) 
         DatasetShard(scans, chosen, None if frame is None else Pose.from_matrix(frame).inverse().matrix),
         transport,
         log_map(config),
-        rate=config.log.rate,
+        rate=config.sensor.rate,
         store=store,
         announce_every=config.network.announce,
         budget=config.network.budget,
@@ -365,7 +365,7 @@ def _facts_of_log(config: DictConfig) -> dict[str, Any]:
         # Options of earlier versions, whose stores have them.
         "log.every": 1,
         "log.part": _PART,
-        **({"log.start": "unknown"} if config.log.start == "unknown" else {}),
+        **({"log.start": "unknown"} if config.start == "unknown" else {}),
         "team.size": config.team.size,
     }
 

@@ -72,7 +72,8 @@ def open_node(config: DictConfig) -> Node:
 
 def play(config: DictConfig, node: Node) -> None:
     """Publish a recording, once somebody subscribes to it."""
-    player = BagPlayer(node, config.play, config.rate)
+    with naming({"rate": "speed"}):
+        player = BagPlayer(node, config.play, config.speed)
     for topic in player.unknown:
         print(f"skipped   {topic.name}: {topic.type} is not a type of ROS 2 Jazzy")
     if not player.wait_for_subscriber(config.wait):

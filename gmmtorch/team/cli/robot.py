@@ -52,12 +52,6 @@ class LogOptions:
         None,
         "options of the map that differ from those of map=incremental, as in {name: windowed}",
     )
-    rate: float = option(1.0, "scans per second")
-    start: str = option(
-        "known",
-        "known: the poses of the log; unknown: each robot maps in a frame of its own, and joins that of a "
-        "teammate when it recognises a place",
-    )
 
 
 @dataclass
@@ -66,6 +60,11 @@ class RobotCommand(team_schema.MissionCommand):
 
     id: int = option(0, "this robot's id; unique in the team")
     source: str = option("world", "world: a simulated camera in a simulated world; log: recorded scans")
+    start: str = option(
+        "known",
+        "of source=log. known: the poses of the log; unknown: each robot maps in a frame of its own, and "
+        "joins that of a teammate when it recognises a place",
+    )
     speed: float = option(1.0, "seconds of the robot's time per second")
     settle: float = option(10.0, "seconds without news after the last work, until the robot stops")
     transport: str = option("udp", "udp or zenoh")
@@ -115,7 +114,7 @@ def check_options(config: DictConfig) -> None:
         )
     check_choice("source", config.source, ("world", "log"))
     check_choice("transport", config.transport, TRANSPORTS)
-    check_choice("log.start", config.log.start, ("known", "unknown"))
+    check_choice("start", config.start, ("known", "unknown"))
     size = check_whole("team.size", config.team.size, 1)
     if check_whole("id", config.id, 0) >= size:
         raise InvalidArgumentError(f"id={config.id} must be below team.size={size}: robot ids start at 0.")
@@ -123,8 +122,7 @@ def check_options(config: DictConfig) -> None:
         raise InvalidArgumentError(
             f"network.loss={config.network.loss} must be a share of the datagrams in [0, 1)."
         )
-    rate = "sensor.rate" if config.source == "world" else "log.rate"
-    for name in ("evaluation.every", rate, "speed"):
+    for name in ("evaluation.every", "sensor.rate", "speed"):
         check_number(name, OmegaConf.select(config, name), above=True)
     check_number("settle", config.settle)
     if config.source == "log" and config.log.dataset is None:

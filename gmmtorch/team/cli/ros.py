@@ -56,7 +56,7 @@ class RosCommand(ViewOptions):
         None, "map file in which the sensor is localised, instead of building a map"
     )
     play: str | None = option(None, "recording to publish, instead of building a map")
-    rate: float = option(1.0, "speed of the recording that is played; 2: twice as fast")
+    speed: float = option(1.0, "of the recording that is played; 2: twice as fast")
     remap: Any = option(None, "topic → other topic, as in {/points: /velodyne_points}")
     wait: float = option(10.0, "seconds for the sensor's topic, and of play for a subscriber")
     z_min: float | None = option(

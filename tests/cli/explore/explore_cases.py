@@ -21,7 +21,7 @@ FIELDS = {
 }  # fmt: skip
 
 
-SMALL = ["team.size=2", "sensor.width=48", "sensor.height=36", "runtime.workers=1"]
+SMALL = ["team.size=2", "sensor.width=48", "sensor.height=36", "workers=1"]
 
 
 def run_in(monkeypatch: pytest.MonkeyPatch, folder: Path, room: Path, *options: str) -> Finished:

@@ -57,7 +57,7 @@ from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start
         ("runtime.threads=0", "runtime.threads=0"),
         ("runtime.device=meta", "runtime.device=meta"),
         ("seed=-1", "seed=-1"),
-        ("experiment=fig4_4_entropy runtime.workers=0", "runtime.workers=0"),
+        ("experiment=fig4_4_entropy workers=0", "workers=0"),
         ("experiment=fig4_4_entropy study.name=other", "study.name='other' trials"),
         ("experiment=fig4_4_entropy study.variants=[]", "study.variants study.seeds"),
         ("planner.rest=0", "planner.rest no longer TeamOptions.rest"),

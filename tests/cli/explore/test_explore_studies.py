@@ -171,7 +171,7 @@ def test_no_process_of_a_killed_study_survives(room, tmp_path):
         "world=mesh",
         f"world.path={room}",
         "duration=1e6",
-        "runtime.workers=2",
+        "workers=2",
         *STUDY,
     ]
     with start(killed, *options, *STUDY, temporary=temporary) as process:

@@ -123,7 +123,7 @@ def test_a_robot_continues_on_a_full_disk_and_names_missing_files(run, monkeypat
     monkeypatch.setattr(ReplayMission, "tick", filling)
     shown = ["report.progress=true", "report.figures=true", "report.tensorboard=true"]
     with disk:
-        done = run(*LOG, *shown, "log.rate=3")
+        done = run(*LOG, *shown, "sensor.rate=3")
     assert done.status == 1
     assert done.stdout.count("report.tensorboard is switched off") == 1
     assert done.stdout.count("is no longer written, and the robot continues") == 1
@@ -140,7 +140,7 @@ def test_a_robot_continues_on_a_full_disk_and_names_missing_files(run, monkeypat
 
 def test_a_robot_starts_without_a_writable_store(run, tmp_path):
     (tmp_path / "file").write_text("")
-    done = succeeded(run(*LOG, f"journal.folder={tmp_path / 'file'}", "log.rate=50"))
+    done = succeeded(run(*LOG, f"journal.folder={tmp_path / 'file'}", "sensor.rate=50"))
     assert done.stdout.count("Choose another folder, or run without a store") == 1
     assert done.stdout.count("Set journal.folder to another folder.") == 1
     (row,) = done.results()["rows"]
@@ -149,7 +149,7 @@ def test_a_robot_starts_without_a_writable_store(run, tmp_path):
 
 def test_a_store_on_a_full_disk_is_read(run, monkeypatch, tmp_path):
     kept, disk = tmp_path / "kept", Disk()
-    options = [*LOG, f"journal.folder={kept}", "log.rate=50"]
+    options = [*LOG, f"journal.folder={kept}", "sensor.rate=50"]
     (first,) = succeeded(run(*options)).results()["rows"]
     opened, made = from_options.open_link, ReplayMission.__init__
     disowned: list[frozenset[bytes]] = []
@@ -178,7 +178,7 @@ def test_a_store_on_a_full_disk_is_read(run, monkeypatch, tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 @pytest.mark.slow
 def test_a_robot_continues_without_standard_error(tmp_path):
-    command = [sys.executable, str(CHECKOUT / "scripts" / "robot.py"), *LOG, *QUIET[1:], "log.rate=50"]
+    command = [sys.executable, str(CHECKOUT / "scripts" / "robot.py"), *LOG, *QUIET[1:], "sensor.rate=50"]
     with Path("/dev/full").open("wb") as full:
         done = subprocess.run(
             [*command, "team.size=1", "link.listen=127.0.0.1:0", "hydra.run.dir=run"],
@@ -214,7 +214,7 @@ def test_a_stopped_robot_writes_its_results(run, monkeypatch, name):
 
     monkeypatch.setattr(ReplayMission, "tick", ended)
     monkeypatch.setenv(robot.TEAM_VARIABLE, str(os.getppid()))
-    done = succeeded(run(*LOG, "log.rate=50", "settle=1000"))
+    done = succeeded(run(*LOG, "sensor.rate=50", "settle=1000"))
     (row,) = done.results()["rows"]
     assert row["stopped"] is True
     assert row["scans"] == len(ticks) == 2
@@ -238,7 +238,7 @@ def test_frames_with_another_key_are_counted_and_logged_once(run, tmp_path):
     own.touch(0o600)
     own.write_text(bytes(range(32)).hex())
     with chatter(1, here, TeamKey.generate()) as other:
-        options = [f"link.listen={here}", f"link.key_file={own}", "report.progress=true", "log.rate=4"]
+        options = [f"link.listen={here}", f"link.key_file={own}", "report.progress=true", "sensor.rate=4"]
         done = succeeded(run(*LOG, *options, "team.size=2"))
     (row,) = done.results()["rows"]
     assert row["refused"].keys() == {"wrong_key"}
@@ -279,13 +279,13 @@ def test_a_killed_robot_continues_and_its_teammate_catches_up(run, tmp_path):
     with UdpTransport.unicast(1, there, [from_options.address("here", here)]) as transport:
         address = f"127.0.0.1:{transport.address[1]}"
         of_team = ["team.size=1", f"link.listen={here}", f"link.peers=[{address}]", "journal.folder=kept"]
-        first = start(*log, *of_team, "log.rate=8", "hydra.run.dir=first", cwd=tmp_path)
+        first = start(*log, *of_team, "sensor.rate=8", "hydra.run.dir=first", cwd=tmp_path)
         while first.poll() is None and not saved_scans(tmp_path / "kept" / "robot_0.sqlite"):
             time.sleep(0.1)
         first.kill()
         assert first.wait(60) == -signal.SIGKILL, (tmp_path / "output").read_text()
         transport.deliver(1, 0.0)  # lost
-        again = start(*log, *of_team, "log.rate=50", "settle=5", "hydra.run.dir=again", cwd=tmp_path)
+        again = start(*log, *of_team, "sensor.rate=50", "settle=5", "hydra.run.dir=again", cwd=tmp_path)
         late = ReplayMission(Replica(1), [], transport, GaussianMap, announce_every=0.3)
         while again.poll() is None:
             late.exchange(time.monotonic())
@@ -295,7 +295,7 @@ def test_a_killed_robot_continues_and_its_teammate_catches_up(run, tmp_path):
     assert 10 <= row["resumed_at"] < 32
     assert row["scans"] == row["n_scans"] == 32
     assert row["digest"] == late.replica.digest().hex()
-    (unharmed,) = succeeded(run(*LOG, *log, "log.rate=50")).results()["rows"]
+    (unharmed,) = succeeded(run(*LOG, *log, "sensor.rate=50")).results()["rows"]
 
     def said(path: str) -> Counter[tuple[object, ...]]:
         return content(GaussianMap.load(tmp_path / path).components())

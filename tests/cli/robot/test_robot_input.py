@@ -46,7 +46,7 @@ def test_a_bad_value_is_named_in_one_line(options, words, run):
     [
         ("speed=0", "speed=0.0"),
         ("settle=inf", "settle=inf"),
-        ("log.rate=0", "log.rate=0.0"),
+        ("sensor.rate=0", "sensor.rate=0.0"),
     ],
 )
 def test_paces_are_checked_before_anything_is_opened(options, words, run, monkeypatch):
@@ -61,7 +61,7 @@ def test_paces_are_checked_before_anything_is_opened(options, words, run, monkey
         ("log.map={prior:-1}", "log.map.prior=-1.0"),
         ("log.map={noise:loud}", "log.map={ loud"),
         ("log.map=windowed", "log.map=windowed name"),
-        ("log.start=here", "log.start='here'"),
+        ("start=here", "start='here'"),
     ],
 )
 def test_a_bad_value_for_a_log_is_named_in_one_line(options, words, run):
@@ -96,16 +96,16 @@ def test_a_port_in_use_is_named_with_the_remedy(option, host, remedy, run):
 
 
 def test_a_robot_without_peers_is_warned_of(run):
-    said = succeeded(run(*LOG, "team.size=2", "log.rate=50")).stdout
+    said = succeeded(run(*LOG, "team.size=2", "sensor.rate=50")).stdout
     assert "link.peers=[]: robot 0 sends to no other robot" in said
 
 
 def test_a_store_of_another_log_is_rejected(run, tmp_path):
     kept = f"journal.folder={tmp_path / 'kept'}"
     said = f"{kept} holds no robot_0.sqlite: the map starts empty."
-    assert said in succeeded(run(*LOG, "log.rate=50", kept)).stdout
-    assert "stride" in refused(run(*LOG, "log.rate=50", kept, "log.dataset.stride=3", name="other"))
-    again = succeeded(run(*LOG, "log.rate=40", kept, name="again"))  # the rate may change
+    assert said in succeeded(run(*LOG, "sensor.rate=50", kept)).stdout
+    assert "stride" in refused(run(*LOG, "sensor.rate=50", kept, "log.dataset.stride=3", name="other"))
+    again = succeeded(run(*LOG, "sensor.rate=40", kept, name="again"))  # the rate may change
     assert said not in again.stdout
 
 
