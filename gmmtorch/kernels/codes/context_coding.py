@@ -22,10 +22,12 @@ _CODINGS = templated("codes/context_coding.h", "context_coding", _KINDS, rounds_
 class CodedBatch:
     """K components, S origins and E viewpoints as whole numbers, int64; read into arrays of zeros.
 
-    side: log2 of the side (m) of the cells (K, D) that contain the means. The others: as in `Quantized`.
+    side: log2 of the side (m) of the cells (K, D) that contain the means. coarse: whether means and shears
+    are in steps of the coarse lattice; deviations and counts never are. The others: as in `Quantized`.
     """
 
     side: int
+    coarse: bool
     axis_order: Tensor
     deviation: Tensor
     shear: Tensor
@@ -66,10 +68,10 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Tensor, writ
     waiting, box, *rows = whole.split([n_items, n_items * 2 * batch.dim, n_origins, n_origins])
     numbers = torch.zeros(n_items + 2 * k * batch.dim, dtype=torch.float64)
     distance, *shapes = numbers.split([n_items, k * batch.dim, k * batch.dim])
-    sizes = k, n_origins, len(batch.seen_from), batch.side
+    sizes = k, n_origins, len(batch.seen_from), batch.side, int(batch.coarse)
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)
-    values = list(vars(batch).values())[1:-1]  # without side and cells
+    values = list(vars(batch).values())[2:-1]  # without side, coarse and cells
     kernel = _CODINGS[batch.dim, writes]
     kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result)
     return int(result)

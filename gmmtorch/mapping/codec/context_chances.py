@@ -53,6 +53,28 @@ _GbKc{Y-lsHtnoOwfAketv6oVv_dW*Jwn_GU9o;Wur=O~G4ggN;&Vye=?FZTkY-zyAlh#S)d#ezn<ZlC
 m;?G!I{W%4X^o=3bxBbfYH&PAcqK;}X^A9S|Sy&}7W|_XNe)N%}XEJO}x6|~a&pwO~2*VGe_e;)*krtDt&-I|s-
 pL~%mPQpYC7%3`#3+mBrdT;My_M}=G|C_JzWV83qGjY0_=ocw{mttiIo@`XJ;k*f!xL$5Zcu*gTmA#XM*E-
 """
+OF_COARSE = """
+c-rk+3s96*6h6zNnn`AQI7N`yq$r7qSffBHSTr>-5SUshjYg;=ppx<k6c-i-S>-
+vbM9a%%5nTdS<TW5LqNbn}U`QH*S|FNP8tN#pYZvbS-@CiOLXWMG|C_m-bN=t%bKjTy*mIp{&I5vBLO-wwx`<`Dlzal-
+4$Avn$Fe?Gg`e7@WObVmtOh1@;13y_+IiR7OTeFZ48lXaA<TJmKd-(Uo*md)1);$(vpZY~ydPi+=%d)tU}tU9a<hjAe4Jb^-
+4zj$TveKv^jY+c6Z?Ig_x84ierTHooq5W`)fE8WH7Q~)-Uc`ysc4poknO2xNN@*es8OaT2>}`-6!P6E0PQ7;%$y8>vuz4t-
+35S_EI3hwGH6@ge>G(Wil5Oh%s`o57J$3}bdTd@kBaiYqBeiF5~fW>4G0PVJ%B{xewaNSpg^w=^o#)(zyJ(3ku@WC-Bd1u2LL(!U
+@(||8{=mSBi#q%{q&cM=OzHiKKC=RPoBo|Ak*&)8vr(+IZ61kud&QzY?EmK%VPGBaS<JfRk7XKA!+e6szS^flK!_5%JAx`--
+#}6#<EF;x2d^L^xRe~tMe#7x8@GfML%L$sgm9z@-op=>ajdjP5J3T=ZG$lV_CeB@=IH&zJG-BTVCrUx>P!xUr<BmRdMBT-
+aeD+!V&z>-=@6}EfbF_Nc-hrRq{m?;g_U$61|*h*mTDBlo&weFSiN*Ju{SKjP11@;Ajuct6L-
+Q#T(GnSLsxl2EV=*;K+4qU)A8l&{S^IR=07CVGED00ah<f!RqcW$tN&>sgZV&Ggi}Vv1~<4g;I;}4Al1bs4E!I;5|??i+fe#Yw)u
+WZzXIe_6G;COlIsS1JP8UyOnlO@J6-
+t`s)CUjGZ^?YI*u~4F0kYz;!MBh7|R=s)=_K0kUA?LL3gzMMn?xY4C6C1o)_(jv&!h^>IEg8o+mF1>x)JU{b+D`b29~6}2^&N53)
+BTZ82lhb1ZWLz+5o9&6g+xV_*8Yo}-K7?KI`(GG+1l{m)>3(wM3JC0e3$J-
+6hf!^I0%{&f}__^!~_s!5>GcbYOz<~n?4v!z2AM^V8qi|XaUjc8PxvPcG1MT~tiH=J;_HXyOW64^{En?>%$1;_<7qAw*{H<r@1Hy
++h=QlB9n@P|SxRCnOJYHEQhw`10q(@jgON=)o+x_tl+$?_i;blU45fCF&-=7-=!zC-XutVHRFganqcTTfspuC>7vkUQFQsj$wuJ!
+>7JJv?UonrX|wfJOR#@MeFzEk5BD<B8#yuGX0eeb73_a|OfR~)?8^VxZplbJZQMGj{37uwx_Z(ZCf_S`L!sPCgqlFe_;T<Mp{u0d
+j1^3Y{Q(A#`bEZ2P;IB?*=VS=Jp$NtfNQFd2{{zDTTN}C#~eT?f;4*w$DP;k+qe^V5mu?iWLcL9Z-lUG0~Yx6aDdw8h-
+dVqBF{Wl6rwd8LFU}*IIC;!{_cU3t{js#m6cBTENV2HvCS{}(<!*;rd<kH)2_WhKczu!t)vxz>B4tuK^e5`kJ?H<+t;G49;s?qab
+8kXj=B`2R;Bb1lpqmmC}&xc?y_taVvKf4P{wwSX(<Y(nxOdXz5_pb-?d8YQx4fIPjH|aTW;4mqWD&w!dr-
+h&63$Q|Vhx}|oQioU8d`Z!`{PP~6z_YF)FWgV1;>%d&$~`^*K>43X|9fn_J4yL=6ye|U#Ko75EBzEyFrJaA9esfhdB|!ODs^D-
+Xp}l?<Nq%H>-;A(@c3n+&;DvofJM9p&-+-NFHz@nN$>b$u}J6T_eELm(=tAI<E+1d(To*~1vqt3w0s|CqsAO>e*il6$<_
+"""
 OF_ATTRIBUTES = """
 c-ouJ$iTqJ$oQWD4*sLiQRNH_s~;@=3zI!}`4X63%&-
 hhH#adb9QyDZuKPBWxe3besbgR`{S#sOJqA>u1(bJ5u9~%W%PlZ}>bx~O4qOGA+dg&jq`DaliuDW(R%Kg`UAY5MKYitiOItwdTIb

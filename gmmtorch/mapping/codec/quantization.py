@@ -124,16 +124,17 @@ class Quantized:
         )
 
 
-def quantize(components: Components) -> Quantized:
-    """The components rounded to whole numbers.
+def quantize(components: Components, coarse: bool = False) -> Quantized:
+    """The components rounded to whole numbers; those of the coarse lattice, if `coarse`.
 
     Viewpoints are sorted by component, then by the coordinates of the origin. Origins that round to the same
     place become one; origins without a viewpoint are dropped. Raises `InvalidArgumentError` for values that
     are too large to be stored, see `lattice` and `LARGEST_COUNT`.
     """
     c = components.on_cpu()
-    places = lattice.nearest(c.means.double(), c.covariances.double())
+    places = lattice.nearest(c.means.double(), c.covariances.double(), coarse)
     count = _support_steps(c.support.double())
+    count = coarse_counts(count) if coarse else count
     by, seen, counts = c.seen_by.numpy(), c.seen_from.numpy(), c.seen_count.numpy().astype(np.float64)
     order = np.argsort(by, kind="stable")
     order = order[(counts[order] > 0) | (_largest(counts[order], by[order]) == 0)]
@@ -167,9 +168,15 @@ def quantize(components: Components) -> Quantized:
     )
 
 
-def quantized(components: Components) -> Components:
-    """The components after writing and reading them, on their device, without writing bits."""
-    return quantize(components).restored().to(components.means.device)
+def quantized(components: Components, coarse: bool = False) -> Components:
+    """The components after writing and reading them, on their device, without writing bits; those of the
+    coarse lattice, if `coarse`, which take a third fewer bytes."""
+    return quantize(components, coarse).restored().to(components.means.device)
+
+
+def coarse_counts(steps: Tensor) -> Tensor:
+    """The nearest even steps of counts, or `NO_COUNT`."""
+    return torch.where(steps == NO_COUNT, steps, (steps / 2).round().long() * 2)
 
 
 def _support_steps(support: Tensor) -> Tensor:

@@ -269,13 +269,11 @@ class SurfaceFit:
     rule: MixtureRule = field(default_factory=MixtureRule)
 
 
-def fit_window(
-    scans: Sequence[Scan], fit: SurfaceFit, viewpoints: AssignViewpoints, empty_fit: SurfaceFit | None = None
-) -> Components:
+def fit_window(scans: Sequence[Scan], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
     """Components of the returns of S scans, then `max_range` components of the ends of no-return beams.
 
-    `empty_fit`: for the no-return beams, if it differs from `fit`. `fit.rule.free_points` points on each
-    other beam are treated as ends of no-return beams. Components are not numbered.
+    `fit.rule.free_points` points on each other beam are treated as ends of no-return beams. Components are
+    not numbered.
     """
     origins = torch.stack([scan.origin.double() for scan in scans])
     channels = [scan.attributes for scan in scans]
@@ -286,7 +284,7 @@ def fit_window(
         ends = [torch.cat([scan.no_return, _points_before(scan, n_free)]) for scan in scans]
     if not any(len(end) for end in ends):
         return returns
-    empty = fit_points(ends, origins, empty_fit or fit, viewpoints, max_range=True)
+    empty = fit_points(ends, origins, fit, viewpoints, max_range=True)
     return Components.concatenate([returns, empty])
 
 

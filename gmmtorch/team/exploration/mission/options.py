@@ -26,8 +26,6 @@ _MOST_ROBOTS = 31
 """Bits of the integer that stores which robots saw a cell."""
 _LATE_JITTERS = 5
 """Mean jitters. Less than 1 % of the datagrams arrive later."""
-_EMPTY_LENGTH = 2 / 3
-"""Length of components of free space, as a share of that of surfaces."""
 _FLAT = 0.5
 """Thickness of a flat piece, as a share of `FrameRule.side`."""
 
@@ -133,7 +131,7 @@ class FrameRule:
             raise InvalidArgumentError(f"update_at={self.update_at} must be at least 1, and finite.")
 
     def surface_fit(self) -> SurfaceFit:
-        """How the returns of a frame become components."""
+        """How the returns of a frame, and the ends of its no-return beams, become components."""
         from gmmtorch.mapping import cell_fit
         from gmmtorch.mixture import least_support
 
@@ -143,10 +141,6 @@ class FrameRule:
             fit.flatness, thickness=_FLAT * self.side, min_weight=least, min_weight_thick=_FLAT * least
         )
         return replace(fit, flatness=flat)
-
-    def empty_fit(self) -> SurfaceFit:
-        """The same for no-return beams: finer, because they end at the edges of the field of view."""
-        return replace(self, length=_EMPTY_LENGTH * self.length).surface_fit()
 
 
 @dataclass(frozen=True)
