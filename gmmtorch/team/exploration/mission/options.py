@@ -177,7 +177,7 @@ class TeamOptions(LinkConditions):
     planning_prior: occupancy of unobserved cells in the information of a view.
     window: cells along x, y and z of the local map around a robot, for planning, at least: it contains what
     the camera sees.
-    codec: of components: quantized (about 4.5 bytes each, on the coarse lattice), float, or thesis (57 bytes), see `CODECS`.
+    codec: of components: quantized (about 4.5 bytes each), float, or thesis (57 bytes), see `CODECS`.
     margin: metres between robots. device: of the maps, of learning, and of the information of views; sensing,
     planning and messages are on the CPU. A robot plans once every `dynamics.duration`.
     """
