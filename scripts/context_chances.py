@@ -145,7 +145,7 @@ def main() -> None:
 def packed(chances: Tensor) -> str:
     text = base64.b85encode(zlib.compress(bytes(chances.tolist()), 9)).decode()
     assert not set(text) & set('"\\')
-    return "\n" + "\n".join(textwrap.wrap(text, 100)) + "\n"
+    return "\n" + "\n".join(textwrap.wrap(text, 109, break_on_hyphens=False)) + "\n"
 
 
 def save(fine: str, coarse: str, attributes: str) -> None:

@@ -22,7 +22,7 @@ import gmmtorch as gt
 
 def sharing(scans: list[Any]) -> dict[str, Target]:
     """Datagrams and frames of teams, codes of points, and stores."""
-    from mapping.test_batches import around_a_sensor
+    from mapping.random_components import around_a_sensor
     from sharing.message_examples import channel_examples, examples
     from sharing.structured_bodies import structured
 

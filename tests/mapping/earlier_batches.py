@@ -31,7 +31,7 @@ EARLIER = {
         "0addb3f5c4392b357e04ea6ac417ebf7",
     ),
     "version 4": (
-        "1js-L003H@U&oTT@<w7vJfpLMM96g|6e<K_I2qmXu~P@pFfMecFdNzsd8yq?s&WphqSFUhD=57fVJ~5u&AikAy+EedAb<",
+        "1js-L003H@U&oTT@<w`y7c9>c$-4dbWrO;bcxM)ziZW0JP%FmcrWOtp#D2>kIlG|Jd#n-J+pdww){iEje4X}5LaT(H!|)j",
         "bba5c28e77a767b9c90e00f1991439ca",
     ),
 }

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from kernels.twins import by_both
 from mapping.earlier_batches import EARLIER
 from mapping.map_cases import assert_same_components
-from mapping.random_components import drawn, random_components
+from mapping.random_components import around_a_sensor, drawn, random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.codes import context_coding
@@ -52,22 +52,6 @@ def sound(request) -> bytes:
     if request.param == "around a sensor":
         return encode(around_a_sensor(12))
     return encode(quantized(random_components(3, k=12), coarse=request.param == "coarse"))
-
-
-def around_a_sensor(k: int) -> Components:
-    """Coarse components of a frame: half are surfaces, half the ends of no-return beams of 6 m."""
-    generator = torch.Generator().manual_seed(k)
-    drawn = random_components(3, k=k, n_origins=1, max_sightings=1, seed=k)
-    rays = torch.nn.functional.normalize(torch.randn(k, 3, generator=generator).double(), dim=1)
-    rays = torch.nn.functional.normalize(rays + torch.tensor([2.0, 1.0, 0.3]), dim=1)
-    flat = 0.15 * torch.eye(3, dtype=torch.float64) - 0.149 * rays[:, :, None] * rays[:, None, :]
-    made = replace(
-        drawn,
-        means=drawn.origins[:1] + 5.98 * rays,
-        covariances=torch.where((torch.arange(k) % 2 == 0)[:, None, None], flat, 0.1 * drawn.covariances),
-        max_range=torch.arange(k) % 2 == 0,
-    )
-    return quantized(replace(made.rearranged(spatial_order(made)), ids=drawn.ids), coarse=True)
 
 
 def test_every_cut_and_every_flipped_bit_is_refused(sound):

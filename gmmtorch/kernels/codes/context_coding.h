@@ -109,22 +109,12 @@ struct Walk {
         if (i == 0) return 5;
         const double *n = s.normal + (i - 1) * DIM, *m = s.place + (i - 1) * DIM;
         const int64_t* d = b.deviation + (i - 1) * DIM;
-        const bool from_eye = is_round && radius > 0.0;
-        const double side = two_to(b.side), *from = from_eye ? eye : m;
-        double apart = 0.0, along = n[a], v[DIM];
-        for (int x = 0; x < DIM; ++x) {
-            v[x] = ((double)corner[x] + 0.5 * (double)width[x]) * side - from[x];
-            apart = apart + (from_eye ? v[x] : n[x]) * v[x];
-        }
-        if (from_eye) {
-            const double far = sqrt(apart);
-            along = far > 0.0 ? v[a] / far : 0.0;
-            apart = far - radius;
-        } else if (d[DIM - 2] - d[DIM - 1] < 4) {
-            return 5;
-        }
-        if (fabs(along) < 0.25) return 5;
-        const double quarter = along * (0.25 * (double)width[a] * side);
+        if (d[DIM - 2] - d[DIM - 1] < 4 || fabs(n[a]) < 0.25) return 5;
+        const double side = two_to(b.side);
+        double apart = 0.0;
+        for (int x = 0; x < DIM; ++x)
+            apart = apart + n[x] * (((double)corner[x] + 0.5 * (double)width[x]) * side - m[x]);
+        const double quarter = n[a] * (0.25 * (double)width[a] * side);
         const double nearer = fabs(apart - quarter) - fabs(apart + quarter), most = 2.0 * fabs(quarter);
         return nearer < -0.75 * most   ? 0
                : nearer < -0.25 * most ? 1
@@ -172,8 +162,7 @@ struct Walk {
         for (int a = 0; a < DIM; ++a) corner[a] -= offset;
         for (int64_t l = level - 2; l >= 0; --l)
             for (int a = 0; a < DIM; ++a) {
-                const int64_t context =
-                    halving(i, corner, width, a) + 6 * (level >= 4) + 12 * (is_round && radius > 0.0);
+                const int64_t context = halving(i, corner, width, a) + 6 * (level >= 4);
                 width[a] >>= 1;
                 corner[a] += c.bit(slots(Field::LOWER, context, 1), (now[a] >> l) & 1) * width[a];
             }
@@ -354,17 +343,8 @@ struct Walk {
         cell(i, flag);
         if (!c.good) return;
         const double apart = neighbours(i, j, k);
-        int64_t near =
+        const int64_t near =
             i > 0 ? (flag * 2 + (b.axis_order[j] == b.axis_order[k])) * 6 + b.axis_order[j] : 24 + flag;
-        if (is_round) {
-            double most = -1.0;
-            int toward = 0;
-            for (int a = 0; a < DIM; ++a) {
-                const double x = fabs(((double)s.cell[i * DIM + a] + 0.5) * two_to(b.side) - eye[a]);
-                if (x > most) most = x, toward = a;
-            }
-            near = 26 + toward * 6 + (i > 0 ? b.axis_order[j] : 0);
-        }
         const int64_t order = c.tree(slots(Field::ORDER, near, 8), DIM == 3 ? 3 : 1, b.axis_order[i]);
         b.axis_order[i] = order;
         check(order < (DIM == 3 ? 6 : 2));
@@ -409,10 +389,9 @@ struct Walk {
         int64_t about = 0;
         if (i > 0) {
             const int64_t both = b.count[j] + b.count[k];
-            about = ((both - area(j) - area(k)) >> 1) + area(i);
-            if (!is_round || !b.max_range[j] || !b.max_range[k]) about = (about + (both >> 1)) >> 1;
+            about = (((both - area(j) - area(k)) >> 1) + area(i) + (both >> 1)) >> 1;
         }
-        const int64_t unit = 1 + b.coarse, context = flag + 2 * (i == 0) + 4 * is_round;
+        const int64_t unit = 1 + b.coarse, context = flag + 2 * (i == 0);
         about = floor_of(about, unit) * unit;
         b.count[i] =
             about + unit * c.whole(slots(Field::COUNT, context), floor_of(b.count[i] - about, unit), 0);

@@ -56,7 +56,7 @@ FIELDS = {
     "NUMBER": (2, NUMBER),
 }
 """Contexts of each field, and slots of each context."""
-_OF_SPHERES = {"LOWER": 12, "ORDER": 18, "TILT": 14, "SLOPE": 21, "ACROSS": 8, "COUNT": 4}
+_OF_SPHERES = {"TILT": 14, "SLOPE": 21, "ACROSS": 8}
 """Further contexts in coarse batches."""
 
 
@@ -190,32 +190,23 @@ class _Walk:
         for at in range(level - 2, -1, -1):
             for a in dims:
                 context = self._halving(i - 1, corner, width, a) + 6 * (level >= 4)
-                context += 12 * (self.is_round and self.radius > 0)
                 width[a] >>= 1
                 corner[a] += c.bit(self._slots("LOWER", context, 1), now[a] >> at & 1) * width[a]
         v["cells"][i] = corner
         _require(max(map(abs, corner)) <= 2.0 * 134217728.0 * math.ldexp(1, -self.side))
 
     def _halving(self, j: int, corner: Sequence[int], width: Sequence[int], a: int) -> int:
-        """Which half of a block along axis a is nearer to the plane of component j, or to the sphere: 0, the
-        lower one, to 4; 5: there is none."""
-        if j < 0:
+        """Which half of a block along axis a is nearer to the plane of component j: 0, the lower one, to 4;
+        5: it has no plane."""
+        if j < 0 or self.v["deviation"][j][-2] - self.v["deviation"][j][-1] < 4:
             return 5
-        side, from_eye = math.ldexp(1, self.side), self.is_round and self.radius > 0
-        begin = self.eye if from_eye else self.places[j].tolist()
-        v = [(corner[x] + 0.5 * width[x]) * side - begin[x] for x in range(self.dim)]
-        n, apart = v if from_eye else self.normals[j].tolist(), 0.0
+        n, m, side = self.normals[j].tolist(), self.places[j].tolist(), math.ldexp(1, self.side)
+        if abs(n[a]) < 0.25:
+            return 5
+        apart = 0.0
         for x in range(self.dim):
-            apart = apart + n[x] * v[x]
-        along = n[a]
-        if from_eye:
-            far = math.sqrt(apart)
-            along, apart = v[a] / far if far > 0 else 0.0, far - self.radius
-        elif self.v["deviation"][j][-2] - self.v["deviation"][j][-1] < 4:
-            return 5
-        if abs(along) < 0.25:
-            return 5
-        quarter = along * (0.25 * width[a] * side)
+            apart = apart + n[x] * ((corner[x] + 0.5 * width[x]) * side - m[x])
+        quarter = n[a] * (0.25 * width[a] * side)
         nearer, most = abs(apart - quarter) - abs(apart + quarter), 2.0 * abs(quarter)
         if nearer < -0.25 * most:
             return int(nearer >= -0.75 * most)
@@ -270,10 +261,6 @@ class _Walk:
         self._cell(i, flag)
         j, k, apart = self._neighbours(i)
         context = (flag * 2 + (orders[j] == orders[k])) * 6 + orders[j] if i > 0 else 24 + flag
-        if self.is_round:
-            side = math.ldexp(1, self.side)
-            ray = [abs((x + 0.5) * side - o) for x, o in zip(v["cells"][i], self.eye, strict=True)]
-            context = 26 + ray.index(max(ray)) * 6 + (orders[j] if i > 0 else 0)
         orders[i] = c.tree(self._slots("ORDER", context, 8), 3 if self.dim == 3 else 1, orders[i])
         _require(orders[i] < len(AXIS_ORDERS[self.dim]))
         axis = AXIS_ORDERS[self.dim][orders[i]].tolist()
@@ -401,17 +388,14 @@ class _Walk:
         return own, off if self.dim == 3 else rest
 
     def _count(self, i: int, j: int, k: int, flag: int) -> None:
-        count, deviation, flags = self.v["count"], self.v["deviation"], self.v["max_range"]
+        count, deviation = self.v["count"], self.v["deviation"]
         about = 0
         if i > 0:
             area = [sum(deviation[t][: self.last]) for t in (i, j, k)]
             both = count[j] + count[k]
-            about = (both - area[1] - area[2] >> 1) + area[0]
-            if not (self.is_round and flags[j] and flags[k]):
-                about = (about + (both >> 1)) >> 1
+            about = ((both - area[1] - area[2] >> 1) + area[0] + (both >> 1)) >> 1
         about = about // self.unit * self.unit
-        context = flag + 2 * (i == 0) + 4 * self.is_round
-        count[i] = about + self._whole(self._slots("COUNT", context), count[i] - about)
+        count[i] = about + self._whole(self._slots("COUNT", flag + 2 * (i == 0)), count[i] - about)
         count[i] = NO_COUNT if count[i] == NO_COUNT - 1 and self.b.coarse else count[i]
         _require(NO_COUNT <= count[i] <= LARGEST_COUNT)
 
