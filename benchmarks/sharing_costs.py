@@ -21,7 +21,7 @@ from frames import Frame, simulated
 from torch import Tensor
 
 from gmmtorch.experiments.harness import Case, Row, run
-from gmmtorch.mapping.codec.quantization import spatial_order
+from gmmtorch.mapping.codec.quantization import quantized, spatial_order
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.fitting import fit_window
 from gmmtorch.mapping.learning.merging import all_origins
@@ -56,8 +56,8 @@ def learned() -> tuple[list[Frame], list[Components]]:
     """Frames, and the components of each."""
     logging.disable()  # of what is refused
     frames, rule = simulated()[:N_FRAMES], FrameRule()
-    fits = rule.surface_fit(), all_origins(), rule.empty_fit()
-    return frames, [numbered(fit_window([frame.scan], *fits)) for frame in frames]
+    made = [fit_window([frame.scan], rule.surface_fit(), all_origins()) for frame in frames]
+    return frames, [numbered(quantized(one, coarse=True)) for one in made]
 
 
 def message_sizes(options: Any) -> Iterator[Row]:

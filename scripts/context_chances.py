@@ -1,18 +1,19 @@
 """Learns the chances with which the codec's slots begin, and writes them into the package.
 
-    python scripts/context_chances.py
-    python scripts/context_chances.py --attributes   # those of attributes only
+    python scripts/context_chances.py                # those of coarse batches
+    python scripts/context_chances.py --attributes   # those of attributes
 
 They are learned from simulated worlds only: all datagrams of components of two missions, in tunnels and in a
-warehouse other than those of the benchmarks, and the maps of the synthetic buildings; those of attributes
-from the buildings with random colours and reflectivities. Takes about 5 minutes. New chances need a new
-version of batches.
+warehouse other than those of the benchmarks; those of attributes from the synthetic buildings with random
+colours and reflectivities. Those of version 2, from an earlier form of these missions and the maps of the
+buildings, stay as they are. Takes about 5 minutes. New chances need a new version of batches.
 """
 
 from __future__ import annotations
 
 import base64
 import dataclasses
+import itertools
 import math
 import sys
 import textwrap
@@ -29,7 +30,7 @@ from gmmtorch.kernels import ChanceTables, context_coding, number_coding
 from gmmtorch.mapping.codec import context_model, number_model
 from gmmtorch.mapping.codec.attribute_block import rows_of
 from gmmtorch.mapping.codec.component_batch import coded
-from gmmtorch.mapping.codec.context_chances import CHANCES
+from gmmtorch.mapping.codec.context_chances import CHANCES, OF_ATTRIBUTES, OF_COARSE
 from gmmtorch.mapping.codec.quantization import Quantized, cell_exponent, quantize, spatial_order
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.mission.trials import assemble
@@ -67,18 +68,18 @@ def mission_batches(world: str, options: dict, seed: int, duration: float) -> It
 
 
 def in_order(components: gt.Components) -> Quantized:
-    """Quantised components in spatial order, numbered in a row."""
-    values = quantize(components.rearranged(spatial_order(components)))
+    """Coarse components in spatial order, numbered in a row."""
+    values = quantize(components.rearranged(spatial_order(components)), coarse=True)
     values.ids[:, 1] = values.ids[:, 1].sort().values
     return values
 
 
 def learned(batches: Iterable[Quantized]) -> Tensor:
     """The chance of each slot in 1/256; 0: unknown."""
-    tables = blank(context_model.first_tables())
+    tables = blank(context_model.first_tables(coarse=True))
     for values in batches:
         stream = np.zeros(256 + 96 * len(values) + 24 * len(values.origins), np.uint8)
-        batch = coded(values, cell_exponent(values.places))
+        batch = coded(values, cell_exponent(values.places) + 1, coarse=True)
         assert context_coding(batch, tables, stream, writes=True) > 0
     return found(tables)
 
@@ -135,35 +136,26 @@ def learned_attributes() -> Tensor:
     return found(tables)
 
 
-def map_batch(name: str, options: dict, resolution: float) -> Quantized:
-    made = gt.GaussianMap(resolution=resolution)
-    for scan in gt.datasets.load(name, **options):
-        made.insert(scan)
-    return in_order(made.components())
-
-
 def main() -> None:
     if "--attributes" in sys.argv:
-        save(CHANCES, packed(learned_attributes()))
+        save(CHANCES, OF_COARSE, packed(learned_attributes()))
         return
-    batches = [map_batch(*FLAT), *(map_batch(*one) for one in MAPS)]
-    for one in MISSIONS:
-        batches += mission_batches(*one)
-    save(packed(learned(batches)), packed(learned_attributes()))
+    batches = itertools.chain.from_iterable(mission_batches(*one) for one in MISSIONS)
+    save(CHANCES, packed(learned(batches)), OF_ATTRIBUTES)
 
 
 def packed(chances: Tensor) -> str:
     text = base64.b85encode(zlib.compress(bytes(chances.tolist()), 9)).decode()
     assert not set(text) & set('"\\')
-    return "\n" + "\n".join(textwrap.wrap(text, 100)) + "\n"
+    return "\n" + "\n".join(textwrap.wrap(text, 109, break_on_hyphens=False)) + "\n"
 
 
-def save(batches: str, attributes: str) -> None:
+def save(fine: str, coarse: str, attributes: str) -> None:
     TARGET.write_text(
         '"""The chances with which the slots of `context_model` and `number_model` begin, learned from\n'
         "simulated worlds; written by scripts/context_chances.py. A byte for each slot: the probability of\n"
         'a 0 in 1/256; 0: unknown."""\n\n'
-        f'CHANCES = """{batches}"""\nOF_ATTRIBUTES = """{attributes}"""\n',
+        f'CHANCES = """{fine}"""\nOF_COARSE = """{coarse}"""\nOF_ATTRIBUTES = """{attributes}"""\n',
         encoding="utf-8",
     )
 

@@ -22,10 +22,12 @@ import gmmtorch as gt
 
 def sharing(scans: list[Any]) -> dict[str, Target]:
     """Datagrams and frames of teams, codes of points, and stores."""
+    from mapping.random_components import around_a_sensor
     from sharing.message_examples import channel_examples, examples
     from sharing.structured_bodies import structured
 
     from gmmtorch.team.sharing import POINT_CODECS, Replica, Store, TeamKey, ViewLibrary, ViewsMessage, decode
+    from gmmtorch.team.sharing.messages.component_messages import encode_components
     from gmmtorch.team.sharing.messages.datagrams import Kind
     from gmmtorch.team.sharing.point_codecs import point_codec
     from gmmtorch.team.sharing.transport.security import Opener, Sealer
@@ -37,6 +39,7 @@ def sharing(scans: list[Any]) -> dict[str, Target]:
     built.finish()
     replica.add(built.components())
     packets = [*replica.datagrams(1_200)[:8], *examples(), *channel_examples()]
+    packets += encode_components(around_a_sensor(40))
     listeners: dict[str, Any] = {}
 
     def receive(data: bytes) -> None:

@@ -124,6 +124,6 @@ def counts_in(components: list[bytes], counts: list[bytes]) -> dict[tuple[int, i
 
 
 def first_batch() -> tuple[GmmMapper, list[bytes]]:
-    one = mapper(codec="float")
+    one = mapper(codec="float", length=0.6)
     one.sense(frame(*PLACES[0]))
     return one, one.shared.datagrams()

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
+from gmmtorch.mapping.codec.quantization import quantized, spatial_order
 from gmmtorch.mapping.components import Components
 
 
@@ -150,3 +151,19 @@ def estimated_bytes(components: Components) -> int:
     """About the size of the file: 16 bytes a component, 2 a viewpoint beyond the first, 7 an origin."""
     further = len(components.seen_by) - len(components)
     return 300 + 16 * len(components) + 2 * max(0, further) + 7 * len(components.origins)
+
+
+def around_a_sensor(k: int) -> Components:
+    """Coarse components of a frame: half are surfaces, half the ends of no-return beams of 6 m."""
+    generator = torch.Generator().manual_seed(k)
+    drawn = random_components(3, k=k, n_origins=1, max_sightings=1, seed=k)
+    rays = torch.nn.functional.normalize(torch.randn(k, 3, generator=generator).double(), dim=1)
+    rays = torch.nn.functional.normalize(rays + torch.tensor([2.0, 1.0, 0.3]), dim=1)
+    flat = 0.15 * torch.eye(3, dtype=torch.float64) - 0.149 * rays[:, :, None] * rays[:, None, :]
+    made = replace(
+        drawn,
+        means=drawn.origins[:1] + 5.98 * rays,
+        covariances=torch.where((torch.arange(k) % 2 == 0)[:, None, None], flat, 0.1 * drawn.covariances),
+        max_range=torch.arange(k) % 2 == 0,
+    )
+    return quantized(replace(made.rearranged(spatial_order(made)), ids=drawn.ids), coarse=True)

@@ -13,9 +13,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernels.twins import by_both
-from mapping.first_version_batches import FIRST_VERSION
+from mapping.earlier_batches import EARLIER
 from mapping.map_cases import assert_same_components
-from mapping.random_components import drawn, random_components
+from mapping.random_components import around_a_sensor, drawn, random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.codes import context_coding
@@ -47,9 +47,11 @@ def sealed(body: bytes) -> bytes:
     return body + zlib.crc32(body).to_bytes(4, "little")
 
 
-@pytest.fixture(scope="module")
-def sound() -> bytes:
-    return encode(random_components(3, k=12))
+@pytest.fixture(scope="module", params=["fine", "coarse", "around a sensor"])
+def sound(request) -> bytes:
+    if request.param == "around a sensor":
+        return encode(around_a_sensor(12))
+    return encode(quantized(random_components(3, k=12), coarse=request.param == "coarse"))
 
 
 def test_every_cut_and_every_flipped_bit_is_refused(sound):
@@ -96,13 +98,13 @@ def test_forged_batches_are_refused_or_decode_to_valid_components(sound, changes
 
 @pytest.mark.parametrize("k", [2**20, 2**40, 2**61])
 @pytest.mark.parametrize("what", ["components", "origins"])
-@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("version", [1, 2, 4])
 def test_forged_array_lengths_allocate_no_memory(k, what, version):
     writer = BitWriter()
-    if version == 2:
+    if version > 1:
         writer.one(1 << 5, 6)  # 3D, cells of 2⁻²⁰ m
     sizes = (k, 1) if what == "components" else (1, k)
-    for number in (*sizes, 0) if version == 2 else (3, *sizes):
+    for number in (*sizes, 0) if version > 1 else (3, *sizes):
         writer.number(number)
     with pytest.raises(DataError, match=r"announced|it is damaged"):
         decode(sealed(bytes([version]) + writer.to_bytes() + bytes(2000)))
@@ -172,23 +174,40 @@ def test_origins_at_equal_distances_are_ranked_as_the_twin_ranks_them(dim):
 # -- earlier versions and the two coders -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", sorted(FIRST_VERSION))
-def test_batches_of_version_1_are_read_as_they_were(name):
-    """The digests of what gmmtorch 2.0 decoded from batches that it had written."""
-    batch, digest = FIRST_VERSION[name]
+@pytest.mark.parametrize("name", sorted(EARLIER))
+def test_earlier_batches_are_read_as_they_were(name):
+    """The digests of what gmmtorch decoded from batches that it had written."""
+    batch, digest = EARLIER[name]
     found = decode(base64.b85decode(batch))
     values = b"".join(value.numpy().tobytes() for value in found.tensors().values())
     assert hashlib.blake2b(values, digest_size=16).hexdigest() == digest
     assert_same_components(decode(encode(found)), quantized(found))
 
 
+@pytest.mark.parametrize("coarse", [False, True])
 @settings(max_examples=40)
 @given(components=drawn)
-def test_the_twin_writes_and_reads_the_bytes_of_the_kernel(components):
-    twin, fused = by_both(lambda: encode(components))
+def test_the_twin_writes_and_reads_the_bytes_of_the_kernel(components, coarse):
+    once = quantized(components, coarse)
+    twin, fused = by_both(lambda: encode(once))
     assert twin == fused
     for found in by_both(lambda: decode(fused)):
-        assert_same_components(found, quantized(components))
+        assert_same_components(found, once)
+
+
+@pytest.mark.parametrize("k", [1, 2, 60])
+def test_the_twin_writes_and_reads_components_around_a_sensor(k):
+    made = around_a_sensor(k)
+    twin, fused = by_both(lambda: encode(made))
+    assert twin == fused
+    for found in by_both(lambda: decode(fused)):
+        assert_same_components(found, made)
+
+
+def test_ends_of_beams_of_one_length_take_fewer_bytes_around_their_sensor():
+    """What the sphere tells: the same components, seen from elsewhere."""
+    made = around_a_sensor(60)
+    assert len(encode(made)) + 40 < len(encode(replace(made, origins=made.origins + 40.0)))
 
 
 @settings(max_examples=80)
@@ -220,7 +239,7 @@ def test_the_twin_and_the_kernel_agree_about_forged_batches(sound, changes):
 )
 def test_coded_bits_and_numbers_are_read_as_written_in_about_the_entropy(bits, numbers):
     """Against the sum of −log₂ of the chances, which exact arithmetic coding reaches."""
-    writer = RangeCoder(context_model.first_tables())
+    writer = RangeCoder(context_model.first_tables(coarse=False))
     ideal = 0.0
     for slot, bit in bits:
         chance = writer.chances[slot] / 65536
@@ -229,7 +248,7 @@ def test_coded_bits_and_numbers_are_read_as_written_in_about_the_entropy(bits, n
     assert 8 * len(writer.to_bytes().rstrip(b"\0")) <= ideal * 1.001 + 16
     for number in numbers:
         writer.whole(40, number)
-    reader = RangeCoder(context_model.first_tables(), writer.to_bytes())
+    reader = RangeCoder(context_model.first_tables(coarse=False), writer.to_bytes())
     assert [reader.bit(slot, 0) for slot, _ in bits] == [int(bit) for _, bit in bits]
     assert [reader.whole(40, 0) for _ in numbers] == numbers
 

@@ -7,12 +7,14 @@
 
 namespace gmm {
 
-// The K components, S origins and E viewpoints of a batch, as in `Quantized`. cells: side 2^side m.
+// The K components, S origins and E viewpoints of a batch, as in `Quantized`. cells: side 2^side m. coarse: 0
+// or 1.
 struct Batch {
     int64_t k;
     int64_t n_origins;
     int64_t n_seen;
     int64_t side;
+    int64_t coarse;
     int64_t* axis_order;
     int64_t* deviation;
     int64_t* shear;
@@ -74,7 +76,8 @@ struct Walk {
     int64_t offset, nearest;
     int64_t level_begin[24], n_waiting, work;  // of the tree of origins and its heap; items taken from it
     int levels;
-    bool is_slow;
+    bool is_slow, is_round;   // whether the component is near a sphere around the only origin
+    double eye[DIM], radius;  // of that sphere; 0: not known
 
     GMM_INLINE int64_t slots(int field, int64_t context, int64_t size = 32) const {
         return c.s.first_slot[field] + context * size;
@@ -193,33 +196,141 @@ struct Walk {
     GMM_INLINE void deviations(int64_t i, int64_t j, int64_t k, int64_t flag) {
         const int64_t *x = b.deviation + j * DIM, *y = b.deviation + k * DIM;
         int64_t* d = b.deviation + i * DIM;
+        const int64_t unit = 1 + b.coarse;
+        auto whole = [&](int64_t slot, int64_t value, int64_t side) {
+            return unit * c.whole(slot, value / unit, side);
+        };
+        auto number = [&](int64_t slot, int64_t value) { return unit * c.number(slot, value / unit); };
         if (i == 0) {
-            d[0] = c.whole(slots(Field::WIDE, 2 + flag), d[0], 0);
-            if (DIM == 3) d[1] = d[0] - c.number(slots(Field::RATIO, 10 + flag), d[0] - d[1]);
-            d[DIM - 1] = d[DIM - 2] - c.number(slots(Field::THIN, 6 + flag), d[DIM - 2] - d[DIM - 1]);
+            d[0] = whole(slots(Field::WIDE, 2 + flag), d[0], 0);
+            if (DIM == 3) d[1] = d[0] - number(slots(Field::RATIO, 10 + flag), d[0] - d[1]);
+            d[DIM - 1] = d[DIM - 2] - number(slots(Field::THIN, 6 + flag), d[DIM - 2] - d[DIM - 1]);
         } else {
-            const int64_t wide = (x[0] + y[0]) >> 1;
-            d[0] = wide + c.whole(slots(Field::WIDE, flag), d[0] - wide, 0);
+            const int64_t wide = floor_of(x[0] + y[0], 2 * unit) * unit;
+            d[0] = wide + whole(slots(Field::WIDE, flag), d[0] - wide, 0);
             if (DIM == 3) {
                 const int64_t ratio = (x[0] - x[1] + y[0] - y[1]) >> 2;
-                d[1] =
-                    d[0] - c.number(slots(Field::RATIO, flag * 5 + minimum(ratio, (int64_t)4)), d[0] - d[1]);
+                d[1] = d[0] - number(slots(Field::RATIO, flag * 5 + minimum(ratio, (int64_t)4)), d[0] - d[1]);
             }
-            const int64_t thin = minimum((x[DIM - 1] + y[DIM - 1]) >> 1, d[DIM - 2]);
+            const int64_t thin = minimum(floor_of(x[DIM - 1] + y[DIM - 1], 2 * unit) * unit, d[DIM - 2]);
             const int64_t apart = x[DIM - 1] > y[DIM - 1] ? x[DIM - 1] - y[DIM - 1] : y[DIM - 1] - x[DIM - 1];
             const int64_t context = flag * 3 + minimum(apart / 3, (int64_t)2);
-            d[DIM - 1] = thin + c.whole(slots(Field::THIN, context), d[DIM - 1] - thin, thin == d[DIM - 2]);
+            d[DIM - 1] = thin + whole(slots(Field::THIN, context), d[DIM - 1] - thin, thin == d[DIM - 2]);
         }
         for (int a = 0; a < DIM; ++a) check(d[a] <= 80 && d[a] >= -80 && (a == 0 || d[a] <= d[a - 1]));
         check(d[0] - d[DIM - 1] <= 80);
     }
 
+    // log2 of the step of a mean with this deviation, or of a shear with this ratio of deviations.
+    GMM_INLINE int64_t step_of(int64_t d) const { return floor_of(d, 4) - 2 + 2 * b.coarse; }
+
     GMM_INLINE double slope_of(int64_t i, int pair, int row, int column) {
         const int64_t* d = b.deviation + i * DIM;
-        const double value =
-            (double)b.shear[i * PAIRS<DIM> + pair] * two_to(floor_of(d[row] - d[column], 4) - 2);
+        const double value = (double)b.shear[i * PAIRS<DIM> + pair] * two_to(step_of(d[row] - d[column]));
         check(fabs(value) <= 2.0);
         return value;
+    }
+
+    // The slopes of the last axis along the others, as on the plane of component j; whether it has one.
+    GMM_INLINE bool plane(int64_t i, int64_t j, const int* axis, double* given) const {
+        const int64_t *d = b.deviation + i * DIM, *e = b.deviation + j * DIM;
+        const double* n = s.normal + j * DIM;
+        if (i == 0 || e[DIM - 2] - e[DIM - 1] < 4 || d[DIM - 2] - d[DIM - 1] < 2) return false;
+        return slopes_of(n, axis, given);
+    }
+
+    // Those on the plane with this normal.
+    GMM_INLINE bool slopes_of(const double* n, const int* axis, double* given) const {
+        double most = 0.0;
+        for (int a = 0; a < DIM; ++a) most = maximum(most, fabs(n[a]));
+        bool gentle = fabs(n[axis[DIM - 1]]) > 0.25 * most;
+        for (int a = 0; a < DIM - 1 && gentle; ++a) given[a] = -n[axis[a]] / n[axis[DIM - 1]];
+        for (int a = 0; a < DIM - 1; ++a) gentle = gentle && fabs(given[a]) <= 2.0;
+        for (int a = 0; a < DIM - 1; ++a) given[a] = gentle ? given[a] : 0.0;
+        return gentle;
+    }
+
+    // The shears, near the given slopes; `own` becomes the slopes. Returns how far they are from those given.
+    GMM_INLINE int64_t shears(int64_t i, int64_t j, int64_t flag, bool flat, const double* given,
+                              double* own) {
+        const int64_t *d = b.deviation + i * DIM, *e = b.deviation + j * DIM;
+        int64_t* l = b.shear + i * PAIRS<DIM>;
+        int64_t off = 0;
+        double turn = 0.0;
+        if (DIM == 3) {
+            const int64_t finer = -floor_of(d[1] - d[0], 4);
+            l[0] = c.whole(slots(Field::TURN, flag * 8 + minimum(finer, (int64_t)7)), l[0], 0);
+            turn = slope_of(i, 0, 1, 0);
+            const int64_t step = step_of(d[DIM - 1] - d[1]), fine = minimum(-step / 2 + b.coarse, (int64_t)6);
+            const int64_t about = (int64_t)floor(given[1] * two_to(-step) + 0.5);
+            int64_t context = flat ? 7 + fine * 3 + minimum((e[1] - e[DIM - 1]) / 6, (int64_t)2) : fine;
+            context = is_round ? 56 + flat * 7 + fine : flag * 28 + context;
+            off = c.whole(slots(Field::TILT, context), l[PAIRS<DIM> - 1] - about,
+                          (about > 0) + 2 * (about < 0));
+            l[PAIRS<DIM> - 1] = about + off;
+            own[1] = slope_of(i, PAIRS<DIM> - 1, DIM - 1, 1);
+            if (!c.good) return 0;
+        }
+        const int64_t step = step_of(d[DIM - 1] - d[0]), fine = minimum(-step / 2 + b.coarse, (int64_t)6);
+        const int64_t about = (int64_t)floor((given[0] + own[1] * turn) * two_to(-step) + 0.5);
+        const int64_t context = (is_round ? 84 : flag * 42 + flat * 21) + fine * 3
+                                + minimum((off < 0 ? -off : off) / 2, (int64_t)2);
+        const int64_t rest =
+            c.whole(slots(Field::SLOPE, context), l[PAIRS<DIM> / 2] - about, (about > 0) + 2 * (about < 0));
+        l[PAIRS<DIM> / 2] = about + rest;
+        own[0] = slope_of(i, PAIRS<DIM> / 2, DIM - 1, 0) - own[1] * turn;
+        return DIM == 2 ? rest : off;
+    }
+
+    // By how much a component with this distance from the origin is before the sphere on which its points
+    // are.
+    GMM_INLINE double sagitta(const int64_t* d, double distance) const {
+        return (two_to(floor_of(d[0], 2)) + two_to(floor_of(d[DIM - 2], 2))) / (2.0 * distance);
+    }
+
+    // The mean in its cell: freely along the component; across it near the plane of component j, or the
+    // sphere.
+    GMM_INLINE void mean(int64_t i, int64_t j, int64_t flag, const int* axis, double apart, bool flat,
+                         const double* given, const double* own, int64_t off) {
+        const int64_t* d = b.deviation + i * DIM;
+        const double size = two_to(2 * floor_of(d[0], 4));
+        double across = flat ? s.place[j * DIM + axis[DIM - 1]] : 0.0, squares = 0.0;
+        for (int a = 0; a < DIM; ++a) {
+            const int64_t exponent = step_of(d[a]), where = s.cell[i * DIM + axis[a]];
+            const int64_t width = maximum(b.side - exponent, (int64_t)0),
+                          coarser = maximum(exponent - b.side, (int64_t)0);
+            check((where & ((1ll << coarser) - 1)) == 0);
+            const int64_t base = coarser > 0 ? where >> coarser : where * (1ll << width);
+            int64_t inside = WRITES ? b.mean[i * DIM + a] - base : 0;
+            const bool guessed = is_round ? radius > 0.0 : flat;
+            if (a == DIM - 1 && guessed && width > 0) {
+                const double corner = (double)where * two_to(b.side), top = (double)((1ll << width) - 1);
+                if (is_round) {
+                    const double near = radius - sagitta(d, radius);
+                    const double rise = sqrt(maximum(near * near - squares, 0.0)), o = eye[axis[a]];
+                    across = o + (corner + 0.5 * two_to(b.side) < o ? -rise : rise);
+                }
+                const double wanted = floor((across - corner) * two_to(-exponent) + 0.5);
+                const int64_t guess = (int64_t)minimum(maximum(wanted, 0.0), top);
+                const int64_t rise = guess, fall = (int64_t)top - guess;
+                const int64_t far = apart < size ? 0 : apart < 4.0 * size ? 1 : apart < 9.0 * size ? 2 : 3;
+                const int64_t turned = minimum((off < 0 ? -off : off) / 3, (int64_t)3);
+                const bool is_in = wanted >= 0.0 && wanted <= top;
+                const int64_t there = is_round ? 64 + is_in * 4 + minimum(width, (int64_t)3)
+                                               : ((flag * 2 + is_in) * 4 + far) * 4 + turned;
+                const int64_t edge = minimum(rise, fall) > 7 ? 0 : rise < fall ? 1 : 2;
+                inside = guess + c.whole(slots(Field::ACROSS, there), inside - guess, edge);
+                check(inside >= 0 && inside <= (int64_t)top);
+            } else {
+                inside = c.raw(width, inside);
+            }
+            b.mean[i * DIM + a] = base + inside;
+            const double place = (double)(base + inside) * two_to(exponent);
+            s.place[i * DIM + axis[a]] = place;
+            squares = squares + (place - eye[axis[a]]) * (place - eye[axis[a]]);
+            if (a < DIM - 1 && flat)
+                across = across + 0.5 * (given[a] + own[a]) * (place - s.place[j * DIM + axis[a]]);
+        }
     }
 
     GMM_INLINE void component(int64_t i) {
@@ -228,6 +339,7 @@ struct Walk {
         const int64_t last = i > 0 ? b.max_range[i - 1] : 0;
         flag = c.bit(slots(Field::FLAG, 2 * last + (i > 1 ? b.max_range[i - 2] : 0), 1), flag);
         b.max_range[i] = flag;
+        is_round = DIM == 3 && b.coarse && flag && b.n_origins == 1;
         cell(i, flag);
         if (!c.good) return;
         const double apart = neighbours(i, j, k);
@@ -245,81 +357,28 @@ struct Walk {
         axis[DIM - 1] = DIM == 2 ? 1 - axis[0] : order % 2 ? (axis[0] == 0 ? 1 : 0) : (axis[0] == 2 ? 1 : 2);
         if (DIM == 3) axis[1] = 3 - axis[0] - axis[DIM - 1];
 
-        // The plane of the nearest component.
-        const double size = two_to(2 * floor_of(d[0], 4));
-        const double* n = s.normal + j * DIM;
-        const int64_t* e = b.deviation + j * DIM;
-        bool flat =
-            i > 0 && e[DIM - 2] - e[DIM - 1] >= 4 && d[DIM - 2] - d[DIM - 1] >= 2 && apart < 64.0 * size;
         double given[DIM], own[DIM];  // slopes of the last axis along the others
         for (int a = 0; a < DIM; ++a) given[a] = own[a] = 0.0;
-        if (flat) {
-            double most = 0.0;
-            for (int a = 0; a < DIM; ++a) most = maximum(most, fabs(n[a]));
-            flat = fabs(n[axis[DIM - 1]]) > 0.25 * most;
-            for (int a = 0; a < DIM - 1 && flat; ++a) given[a] = -n[axis[a]] / n[axis[DIM - 1]];
-            for (int a = 0; a < DIM - 1; ++a) flat = flat && fabs(given[a]) <= 2.0;
-            for (int a = 0; a < DIM - 1; ++a) given[a] = flat ? given[a] : 0.0;
-        }
-        int64_t* l = b.shear + i * PAIRS<DIM>;
-        int64_t off = 0;
-        double turn = 0.0;
-        if (DIM == 3) {
-            const int64_t finer = -floor_of(d[1] - d[0], 4);
-            l[0] = c.whole(slots(Field::TURN, flag * 8 + minimum(finer, (int64_t)7)), l[0], 0);
-            turn = slope_of(i, 0, 1, 0);
-            const int64_t step = floor_of(d[DIM - 1] - d[1], 4) - 2, fine = minimum(-step / 2, (int64_t)6);
-            const int64_t about = (int64_t)floor(given[1] * two_to(-step) + 0.5);
-            const int64_t context = flat ? 7 + fine * 3 + minimum((e[1] - e[DIM - 1]) / 6, (int64_t)2) : fine;
-            off = c.whole(slots(Field::TILT, flag * 28 + context), l[PAIRS<DIM> - 1] - about,
-                          (about > 0) + 2 * (about < 0));
-            l[PAIRS<DIM> - 1] = about + off;
-            own[1] = slope_of(i, PAIRS<DIM> - 1, DIM - 1, 1);
+        if (is_round) {
+            mean(i, j, flag, axis, apart, false, given, own, 0);
             if (!c.good) return;
+            double ray[DIM], squares = 0.0;
+            for (int a = 0; a < DIM; ++a) {
+                ray[a] = s.place[i * DIM + a] - eye[a];
+                squares = squares + ray[a] * ray[a];
+            }
+            const double distance = sqrt(squares);
+            radius = distance > 0.0 ? distance + sagitta(d, distance) : 0.0;
+            shears(i, j, flag, slopes_of(ray, axis, given), given, own);
+            if (!c.good) return;
+        } else {
+            const bool flat = apart < 64.0 * two_to(2 * floor_of(d[0], 4)) && plane(i, j, axis, given);
+            const int64_t off = shears(i, j, flag, flat, given, own);
+            if (!c.good) return;
+            mean(i, j, flag, axis, apart, flat, given, own, off);
         }
-        const int64_t step = floor_of(d[DIM - 1] - d[0], 4) - 2, fine = minimum(-step / 2, (int64_t)6);
-        const int64_t about = (int64_t)floor((given[0] + own[1] * turn) * two_to(-step) + 0.5);
-        const int64_t context =
-            flag * 42 + flat * 21 + fine * 3 + minimum((off < 0 ? -off : off) / 2, (int64_t)2);
-        const int64_t rest =
-            c.whole(slots(Field::SLOPE, context), l[PAIRS<DIM> / 2] - about, (about > 0) + 2 * (about < 0));
-        l[PAIRS<DIM> / 2] = about + rest;
-        own[0] = slope_of(i, PAIRS<DIM> / 2, DIM - 1, 0) - own[1] * turn;
-        if (!c.good) return;
-        if (DIM == 2) off = rest;
         s.normal[i * DIM + axis[DIM - 1]] = 1.0;
         for (int a = 0; a < DIM - 1; ++a) s.normal[i * DIM + axis[a]] = -own[a];
-
-        // The mean in its cell: freely along the component, near the plane across it.
-        double across = flat ? s.place[j * DIM + axis[DIM - 1]] : 0.0;
-        for (int a = 0; a < DIM; ++a) {
-            const int64_t exponent = floor_of(d[a], 4) - 2, where = s.cell[i * DIM + axis[a]];
-            const int64_t width = maximum(b.side - exponent, (int64_t)0),
-                          coarser = maximum(exponent - b.side, (int64_t)0);
-            check((where & ((1ll << coarser) - 1)) == 0);
-            const int64_t base = coarser > 0 ? where >> coarser : where * (1ll << width);
-            int64_t inside = WRITES ? b.mean[i * DIM + a] - base : 0;
-            if (a == DIM - 1 && flat && width > 0) {
-                const double top = (double)((1ll << width) - 1);
-                const double wanted =
-                    floor((across - (double)where * two_to(b.side)) * two_to(-exponent) + 0.5);
-                const int64_t guess = (int64_t)minimum(maximum(wanted, 0.0), top);
-                const int64_t rise = guess, fall = (int64_t)top - guess;
-                const int64_t far = apart < size ? 0 : apart < 4.0 * size ? 1 : apart < 9.0 * size ? 2 : 3;
-                const int64_t turned = minimum((off < 0 ? -off : off) / 3, (int64_t)3);
-                const int64_t there = ((flag * 2 + (wanted >= 0.0 && wanted <= top)) * 4 + far) * 4 + turned;
-                const int64_t edge = minimum(rise, fall) > 7 ? 0 : rise < fall ? 1 : 2;
-                inside = guess + c.whole(slots(Field::ACROSS, there), inside - guess, edge);
-                check(inside >= 0 && inside <= (int64_t)top);
-            } else {
-                inside = c.raw(width, inside);
-            }
-            b.mean[i * DIM + a] = base + inside;
-            const double place = (double)(base + inside) * two_to(exponent);
-            s.place[i * DIM + axis[a]] = place;
-            if (a < DIM - 1 && flat)
-                across = across + 0.5 * (given[a] + own[a]) * (place - s.place[j * DIM + axis[a]]);
-        }
         points(i, j, k, flag);
     }
 
@@ -332,7 +391,11 @@ struct Walk {
             const int64_t both = b.count[j] + b.count[k];
             about = (((both - area(j) - area(k)) >> 1) + area(i) + (both >> 1)) >> 1;
         }
-        b.count[i] = about + c.whole(slots(Field::COUNT, flag + 2 * (i == 0)), b.count[i] - about, 0);
+        const int64_t unit = 1 + b.coarse, context = flag + 2 * (i == 0);
+        about = floor_of(about, unit) * unit;
+        b.count[i] =
+            about + unit * c.whole(slots(Field::COUNT, context), floor_of(b.count[i] - about, unit), 0);
+        if (b.coarse && b.count[i] == -42) b.count[i] = -41;  // no count
         check(b.count[i] >= -41 && b.count[i] <= 160);
     }
 
@@ -516,6 +579,8 @@ struct Walk {
         c.begin();
         for (int64_t i = 0; i < b.k && c.good; ++i) id(i);
         for (int64_t i = 0; i < b.n_origins && c.good; ++i) origin(i);
+        is_round = false, radius = 0.0;
+        for (int a = 0; a < DIM; ++a) eye[a] = b.n_origins > 0 ? (double)b.origins[a] * 0.00390625 : 0.0;
         if (c.good) grow_tree();
         int64_t seen = 0;
         for (int64_t i = 0; i < b.k && c.good; ++i) {

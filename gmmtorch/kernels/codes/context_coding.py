@@ -26,10 +26,12 @@ _CODINGS = templated("codes/context_coding.h", "context_coding", _KINDS, rounds_
 class CodedBatch:
     """K components, S origins and E viewpoints as whole numbers, int64; read into arrays of zeros.
 
-    side: log2 of the side (m) of the cells (K, D) that contain the means. The others: as in `Quantized`.
+    side: log2 of the side (m) of the cells (K, D) that contain the means. coarse: whether means and shears
+    are in steps of the coarse lattice; deviations and counts never are. The others: as in `Quantized`.
     """
 
     side: int
+    coarse: bool
     axis_order: Ints
     deviation: Ints
     shear: Ints
@@ -72,10 +74,10 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Bytes, write
         np.zeros(n_items),
         np.zeros((2, batch.mean.size)),
     )
-    sizes = k, n_origins, len(batch.seen_from), batch.side
+    sizes = k, n_origins, len(batch.seen_from), batch.side, int(batch.coarse)
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)
-    values = list(vars(batch).values())[1:-1]  # without side and cells
+    values = list(vars(batch).values())[2:-1]  # without side, coarse and cells
     kernel = _CODINGS[batch.dim, writes]
     kernel(1, *sizes, *values, *scratch, stream, len(stream), MOST_STEPS, result)
     return int(result[0])

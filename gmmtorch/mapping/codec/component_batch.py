@@ -1,9 +1,9 @@
 """Batches: components as bytes, any number of them; and map files, which hold one. See docs/formats.md.
 
-A component takes 6 to 8 bytes in 3D and 6 in 2D. Its rounding error is bounded in its own standard
-deviations (see `lattice`), and its covariance stays positive definite. A component decodes to the same values
-in every batch: `decode(encode(c))` is `quantized(c)`, and encoding decoded components again, in any grouping,
-changes nothing.
+A component takes 6 to 8 bytes in 3D and 6 in 2D, and a third less on the coarse lattice. Its rounding error
+is bounded in its own standard deviations (see `lattice`), and its covariance stays positive definite. A
+component decodes to the same values in every batch: `decode(encode(c))` is `quantized(c)`, and encoding
+decoded components again, in any grouping, changes nothing.
 
 A batch is its sizes, and one code of all values (`context_model`), in which neighbours predict one another.
 Components in `spatial_order` take the fewest bytes. A batch with channels ends with the block of their
@@ -28,19 +28,20 @@ from gmmtorch.errors import (
     DAMAGED_CONTENT,
     DataError,
     GmmTorchError,
+    InvalidArgumentError,
     check_choice,
     check_resolution,
     check_whole,
 )
 from gmmtorch.files import pack_tensors, read_tensors, require, unpack_tensors
 from gmmtorch.kernels import CodedBatch
-from gmmtorch.linalg import as_tensors
+from gmmtorch.linalg import all_equal, as_tensors
 from gmmtorch.mapping.attributes.moments import Attributes
 from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.context_model import read_batch, write_batch
 from gmmtorch.mapping.codec.first_version import read_first
-from gmmtorch.mapping.codec.lattice import Lattice
+from gmmtorch.mapping.codec.lattice import COARSER, Lattice, nearest
 from gmmtorch.mapping.codec.quantization import (
     LARGEST_SIDE,
     LEAST_SIDE,
@@ -48,6 +49,7 @@ from gmmtorch.mapping.codec.quantization import (
     Quantized,
     cell_exponent,
     cells_of,
+    coarse_counts,
     number_after,
     quantize,
     quantize_numbered,
@@ -59,7 +61,7 @@ from gmmtorch.mapping.query_options import QueryOptions, check_method
 from gmmtorch.occupancy import Calibration
 from gmmtorch.scan import FARTHEST
 
-FIRST_VERSION, BATCH_VERSION, CHANNELS_VERSION = 1, 2, 3
+FIRST_VERSION, BATCH_VERSION, CHANNELS_VERSION, COARSE_VERSION = 1, 2, 3, 4
 _VERSION_BYTES, _CHECKSUM_BYTES = 1, 4
 _SIDE_BITS = 5
 _LONGEST_SIZES = 32  # bytes
@@ -87,14 +89,33 @@ def encode_quantized(values: Quantized, channels: bool = False) -> bytes:
 
 def _geometry(values: Quantized) -> bytes:
     """A batch without attributes and checksum."""
-    k, e, side = len(values), len(values.seen_from), cell_exponent(values.places)
+    places = _coarse_places(values)
+    is_coarse = places is not None
+    if places is not None:
+        values = replace(values, places=places)
+    k, e = len(values), len(values.seen_from)
+    side = min(cell_exponent(values.places) + is_coarse, LARGEST_SIDE)
     writer = BitWriter()
     writer.one(values.places.dim - 2, 1)
     writer.one(side - LEAST_SIDE, _SIDE_BITS)
     for size in (k, len(values.origins), e - k):
         writer.number(size)
-    stream = write_batch(coded(values, side)).ljust(_least_bytes(k, len(values.origins), e), b"\0")
-    return bytes([BATCH_VERSION]) + writer.to_bytes() + stream
+    stream = write_batch(coded(values, side, is_coarse)).ljust(_least_bytes(k, len(values.origins), e), b"\0")
+    return bytes([COARSE_VERSION if is_coarse else BATCH_VERSION]) + writer.to_bytes() + stream
+
+
+def _coarse_places(values: Quantized) -> Lattice | None:
+    """The means and covariances on the coarse lattice, perhaps with other axis orders; None unless all
+    components are on it."""
+    if not len(values) or not np.array_equal(count := values.count.numpy(), coarse_counts(count)):
+        return None
+    means, covariances = values.places.restored()
+    try:
+        places = nearest(means, covariances, coarse=True)
+    except InvalidArgumentError:  # rounded beyond a bound
+        return None
+    found = places.restored()
+    return places if all_equal([(means, found[0]), (covariances, found[1])]) else None
 
 
 def has_channels(batch: bytes) -> bool:
@@ -136,10 +157,10 @@ def _parts(data: bytes) -> tuple[bytes, bytes | None]:
     body, checksum = data[:-_CHECKSUM_BYTES], data[-_CHECKSUM_BYTES:]
     if len(data) <= _CHECKSUM_BYTES:
         raise DataError(f"{len(data)} bytes are too few for a batch of components: it is truncated.")
-    if not FIRST_VERSION <= body[0] <= CHANNELS_VERSION:
+    if not FIRST_VERSION <= body[0] <= COARSE_VERSION:
         raise DataError(
             f"The batch of components is version {body[0]}; this gmmtorch reads versions {FIRST_VERSION} to "
-            f"{CHANNELS_VERSION}. It is foreign or damaged, or gmmtorch needs an update."
+            f"{COARSE_VERSION}. It is foreign or damaged, or gmmtorch needs an update."
         )
     if zlib.crc32(body) != int.from_bytes(checksum, "little"):
         raise DataError("The batch of components does not match its checksum: it is truncated or damaged.")
@@ -148,21 +169,21 @@ def _parts(data: bytes) -> tuple[bytes, bytes | None]:
     size = BitReader(body[_VERSION_BYTES:_LONGEST_SIZES])
     n_bits, n = size.left, size.number()
     begin = _VERSION_BYTES + (n_bits - size.left) // 8
-    if not 0 < n <= len(body) - begin or body[begin] != BATCH_VERSION:
+    if not 0 < n <= len(body) - begin or body[begin] not in (BATCH_VERSION, COARSE_VERSION):
         raise DataError(f"{len(body)} bytes have no batch of {n} bytes: it is damaged.")
     return body[begin : begin + n], body[begin + n :]
 
 
 def _values(body: bytes, most: int | None = None) -> Quantized:
     rest = body[_VERSION_BYTES:]
-    found = read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most)
+    found = read_first(rest) if body[0] == FIRST_VERSION else _read(rest, most, body[0] == COARSE_VERSION)
     farthest = int(FARTHEST / ORIGIN_STEP)
     if not bool(found.places.is_valid().all()) or bool((found.origins.abs() > farthest).any()):
         raise DataError("A mean, a covariance or an origin is out of range: it is damaged.")
     return found
 
 
-def _read(data: bytes, most: int | None) -> Quantized:
+def _read(data: bytes, most: int | None, coarse: bool) -> Quantized:
     """The components of a batch without version and checksum."""
     reader = BitReader(data[:_LONGEST_SIZES])
     n_bits = reader.left
@@ -192,11 +213,12 @@ def _read(data: bytes, most: int | None) -> Quantized:
         "share": (e,),
         "cells": (k, dim),
     }
-    b = CodedBatch(side, **{name: np.zeros(shape, np.int64) for name, shape in rows.items()})
+    b = CodedBatch(side, coarse, **{name: np.zeros(shape, np.int64) for name, shape in rows.items()})
     read_batch(b, stream)
+    shear, mean = (steps << COARSER * coarse for steps in (b.shear, b.mean))
     rank = ranked(b.origins)[0][b.seen_from]
     order = np.argsort(np.arange(k).repeat(b.n_viewpoints) * n_origins + rank, kind="stable")
-    shapes, sights = (b.axis_order, b.deviation, b.shear, b.mean), (b.seen_from[order], b.share[order])
+    shapes, sights = (b.axis_order, b.deviation, shear, mean), (b.seen_from[order], b.share[order])
     *places, count, ids, origins, n, seen_from, share = as_tensors(
         *shapes, b.count, b.ids, b.origins, b.n_viewpoints, *sights
     )
@@ -204,12 +226,13 @@ def _read(data: bytes, most: int | None) -> Quantized:
     return Quantized(Lattice(*places), count, max_range, ids, origins, n, seen_from, share)
 
 
-def coded(values: Quantized, side: int) -> CodedBatch:
-    """The values as the coder takes them."""
+def coded(values: Quantized, side: int, coarse: bool) -> CodedBatch:
+    """The values as the coder takes them. coarse: whether all are on the coarse lattice."""
     tensors = {**vars(values), **vars(values.places)}
     del tensors["places"], tensors["attributes"]
     arrays = {name: np.ascontiguousarray(tensor.numpy(), np.int64) for name, tensor in tensors.items()}
-    return CodedBatch(side, **arrays, cells=np.ascontiguousarray(cells_of(values.places, side)))
+    arrays |= {name: arrays[name] >> COARSER * coarse for name in ("shear", "mean")}
+    return CodedBatch(side, coarse, **arrays, cells=np.ascontiguousarray(cells_of(values.places, side)))
 
 
 def _least_bytes(k: int, n_origins: int, e: int) -> int:

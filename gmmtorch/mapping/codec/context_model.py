@@ -15,10 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels import ChanceTables, CodedBatch, context_coding, is_fused
-from gmmtorch.mapping.codec.context_chances import CHANCES
+from gmmtorch.mapping.codec.context_chances import CHANCES, OF_COARSE
 from gmmtorch.mapping.codec.lattice import (
     AXIS_ORDERS,
     LARGEST_DEVIATION,
@@ -56,6 +57,8 @@ FIELDS = {
     "NUMBER": (2, NUMBER),
 }
 """Contexts of each field, and slots of each context."""
+_OF_SPHERES = {"TILT": 14, "SLOPE": 21, "ACROSS": 8}
+"""Further contexts in coarse batches."""
 
 
 def write_batch(batch: CodedBatch) -> bytes:
@@ -64,7 +67,7 @@ def write_batch(batch: CodedBatch) -> bytes:
     stream = np.zeros(size, np.uint8)
     try:
         if is_fused(_HERE):
-            n = context_coding(batch, copied(first_tables()), stream, writes=True)
+            n = context_coding(batch, copied(first_tables(batch.coarse)), stream, writes=True)
             if n == _TOO_SLOW:
                 raise InvalidArgumentError(
                     f"{len(batch.count)} components have viewpoints that are farther than thousands of the "
@@ -73,7 +76,7 @@ def write_batch(batch: CodedBatch) -> bytes:
                 )
             _require(n >= 0)
             return stream[:n].tobytes().rstrip(b"\0")
-        writer = RangeCoder(first_tables())
+        writer = RangeCoder(first_tables(batch.coarse))
         _Walk(writer, batch).run()
         return writer.to_bytes().rstrip(b"\0")
     except DataError as error:
@@ -89,16 +92,18 @@ def read_batch(batch: CodedBatch, data: bytes) -> None:
     more time than a batch of that length may; the twin does not bound its time."""
     if is_fused(_HERE):
         stream = np.frombuffer(data or b"\0", np.uint8)
-        _require(context_coding(batch, copied(first_tables()), stream, writes=False) >= 0)
+        _require(context_coding(batch, copied(first_tables(batch.coarse)), stream, writes=False) >= 0)
     else:
-        _Walk(RangeCoder(first_tables(), data), batch).run()
+        _Walk(RangeCoder(first_tables(batch.coarse), data), batch).run()
     _require(write_batch(batch) == data.rstrip(b"\0"))
 
 
 @functools.cache
-def first_tables() -> ChanceTables:
+def first_tables(coarse: bool) -> ChanceTables:
     """The tables before the first bit."""
-    return first_chances(CHANCES, [contexts * slots for contexts, slots in FIELDS.values()])
+    more = _OF_SPHERES if coarse else {}
+    sizes = [(contexts + more.get(name, 0)) * slots for name, (contexts, slots) in FIELDS.items()]
+    return first_chances(OF_COARSE if coarse else CHANCES, sizes)
 
 
 # -- the twin: the model ---------------------------------------------------------------------------------
@@ -116,8 +121,11 @@ class _Walk:
         self.places, self.normals = np.zeros(batch.mean.shape), np.zeros(batch.mean.shape)
         self.offset = offset_of(self.side)
         # Lists of Python numbers, which are faster one by one than arrays.
-        self.v = {name: array.tolist() for name, array in vars(batch).items() if name != "side"}
-        self.last = self.dim - 1
+        self.v = {name: value.tolist() for name, value in vars(batch).items() if isinstance(value, Tensor)}
+        self.last, self.unit = self.dim - 1, 1 + batch.coarse
+        self.eye = [0.0] * self.dim
+        self.is_round = False  # whether the component is near a sphere around the only origin
+        self.radius = 0.0  # of that sphere; 0: not known
 
     def run(self) -> None:
         v = self.v
@@ -126,6 +134,7 @@ class _Walk:
         for i in range(len(v["origins"])):
             self._origin(i)
         self._origins = np.array(v["origins"], np.float64).reshape(-1, self.dim) * ORIGIN_STEP
+        self.eye = self._origins[0].tolist() if len(self._origins) else [0.0] * self.dim
         begin = 0
         for i in range(len(v["count"])):
             near = self._component(i)
@@ -216,23 +225,30 @@ class _Walk:
         order = np.argsort(apart, kind="stable")[:2].tolist()
         return first + order[0], first + order[-1], float(apart[order[0]])
 
+    def _whole(self, slots: int, value: int, side: int = 0) -> int:
+        """A whole number of units."""
+        return self.unit * self.c.whole(slots, value // self.unit, side)
+
+    def _number(self, slots: int, value: int) -> int:
+        return self.unit * self.c.number(slots, value // self.unit)
+
     def _deviations(self, i: int, j: int, k: int, flag: int) -> None:
-        c, last = self.c, self.last
+        last, unit = self.last, self.unit
         x, y, d = (self.v["deviation"][t] for t in (j, k, i))
         if i == 0:
-            d[0] = c.whole(self._slots("WIDE", 2 + flag), d[0])
+            d[0] = self._whole(self._slots("WIDE", 2 + flag), d[0])
             if self.dim == 3:
-                d[1] = d[0] - c.number(self._slots("RATIO", 10 + flag), d[0] - d[1])
-            d[last] = d[last - 1] - c.number(self._slots("THIN", 6 + flag), d[last - 1] - d[last])
+                d[1] = d[0] - self._number(self._slots("RATIO", 10 + flag), d[0] - d[1])
+            d[last] = d[last - 1] - self._number(self._slots("THIN", 6 + flag), d[last - 1] - d[last])
         else:
-            wide = (x[0] + y[0]) >> 1
-            d[0] = wide + c.whole(self._slots("WIDE", flag), d[0] - wide)
+            wide = (x[0] + y[0]) // (2 * unit) * unit
+            d[0] = wide + self._whole(self._slots("WIDE", flag), d[0] - wide)
             if self.dim == 3:
                 ratio = (x[0] - x[1] + y[0] - y[1]) >> 2
-                d[1] = d[0] - c.number(self._slots("RATIO", flag * 5 + min(ratio, 4)), d[0] - d[1])
-            thin = min((x[last] + y[last]) >> 1, d[last - 1])
+                d[1] = d[0] - self._number(self._slots("RATIO", flag * 5 + min(ratio, 4)), d[0] - d[1])
+            thin = min((x[last] + y[last]) // (2 * unit) * unit, d[last - 1])
             slots = self._slots("THIN", flag * 3 + min(abs(x[last] - y[last]) // 3, 2))
-            d[last] = thin + c.whole(slots, d[last] - thin, int(thin == d[last - 1]))
+            d[last] = thin + self._whole(slots, d[last] - thin, int(thin == d[last - 1]))
         _require(max(d) <= LARGEST_DEVIATION and min(d) >= LEAST_DEVIATION and d == sorted(d, reverse=True))
         _require(d[0] - d[last] <= LARGEST_RATIO)
 
@@ -242,6 +258,7 @@ class _Walk:
         flags, orders = v["max_range"], v["axis_order"]
         before = 2 * (flags[i - 1] if i > 0 else 0) + (flags[i - 2] if i > 1 else 0)
         flag = flags[i] = c.bit(self._slots("FLAG", before, 1), flags[i])
+        self.is_round = self.dim == 3 and self.b.coarse and flag == 1 and len(v["origins"]) == 1
         self._cell(i, flag)
         j, k, apart = self._neighbours(i)
         context = (flag * 2 + (orders[j] == orders[k])) * 6 + orders[j] if i > 0 else 24 + flag
@@ -250,29 +267,64 @@ class _Walk:
         axis = AXIS_ORDERS[self.dim][orders[i]].tolist()
         self._deviations(i, j, k, flag)
         d = v["deviation"][i]
-        size = math.ldexp(1, 2 * (d[0] // 4))
-        given = self._plane(i, j, axis) if apart < 64.0 * size else None
-        own, off = self._shears(i, j, flag, given)
+        if self.is_round:
+            self._mean(i, j, flag, axis, apart, None, [0.0, 0.0], 0)
+            ray = [float(x) - o for x, o in zip(self.places[i], self.eye, strict=True)]
+            squares = 0.0
+            for x in ray:
+                squares = squares + x * x
+            distance = math.sqrt(squares)
+            self.radius = distance + _sagitta(d, distance) if distance > 0 else 0.0
+            own, _ = self._shears(i, j, flag, self._slopes(ray, axis))
+        else:
+            near = i > 0 and apart < 64.0 * math.ldexp(1, 2 * (d[0] // 4))
+            given = self._plane(i, j, axis) if near else None
+            own, off = self._shears(i, j, flag, given)
+            self._mean(i, j, flag, axis, apart, given, own, off)
         self.normals[i, axis[last]] = 1.0
         for a in range(last):
             self.normals[i, axis[a]] = -own[a]
+        self._count(i, j, k, flag)
+        return j
 
-        # The mean in its cell: freely along the component, near the plane across it.
-        across = float(self.places[j, axis[last]])
+    def _step(self, d: int) -> int:
+        """log2 of the step of a mean with this deviation, or of a shear with this ratio of deviations."""
+        return d // 4 - 2 + 2 * self.b.coarse
+
+    def _mean(
+        self,
+        i: int,
+        j: int,
+        flag: int,
+        axis: Sequence[int],
+        apart: float,
+        given: list[float] | None,
+        own: list[float],
+        off: int,
+    ) -> None:
+        """Code the mean in its cell: freely along the component; across it near the plane of component j, or
+        the sphere."""
+        c, v, last, d = self.c, self.v, self.last, self.v["deviation"][i]
+        side, size = math.ldexp(1, self.side), math.ldexp(1, 2 * (d[0] // 4))
+        across, squares = float(self.places[j, axis[last]]), 0.0
         for a in range(self.dim):
-            exponent, where = d[a] // 4 - 2, v["cells"][i][axis[a]]
+            exponent, where = self._step(d[a]), v["cells"][i][axis[a]]
             width, coarser = max(self.side - exponent, 0), max(exponent - self.side, 0)
             _require(where & (1 << coarser) - 1 == 0)
             base = where >> coarser << width
             inside = v["mean"][i][a] - base if c.writes else 0
-            if a == last and given is not None and width > 0:
-                top = (1 << width) - 1
-                wanted = math.floor(
-                    (across - where * math.ldexp(1, self.side)) * math.ldexp(1, -exponent) + 0.5
-                )
-                guess = min(max(wanted, 0), top)
+            is_guessed = self.radius > 0 if self.is_round else given is not None
+            if a == last and is_guessed and width > 0:
+                corner, top = where * side, (1 << width) - 1
+                if self.is_round:
+                    near, o = self.radius - _sagitta(d, self.radius), self.eye[axis[a]]
+                    rise = math.sqrt(max(near * near - squares, 0.0))
+                    across = o + (-rise if corner + 0.5 * side < o else rise)
+                wanted = math.floor((across - corner) * math.ldexp(1, -exponent) + 0.5)
+                guess, is_in = min(max(wanted, 0), top), 0 <= wanted <= top
                 far = sum(apart >= bound * size for bound in (1.0, 4.0, 9.0))
-                context = ((flag * 2 + (0 <= wanted <= top)) * 4 + far) * 4 + min(abs(off) // 3, 3)
+                context = ((flag * 2 + is_in) * 4 + far) * 4 + min(abs(off) // 3, 3)
+                context = 64 + is_in * 4 + min(width, 3) if self.is_round else context
                 edge = 0 if min(guess, top - guess) > 7 else 1 if guess < top - guess else 2
                 inside = guess + c.whole(self._slots("ACROSS", context), inside - guess, edge)
                 _require(0 <= inside <= top)
@@ -281,32 +333,35 @@ class _Walk:
             v["mean"][i][a] = base + inside
             place = (base + inside) * math.ldexp(1, exponent)
             self.places[i, axis[a]] = place
+            squares = squares + (place - self.eye[axis[a]]) * (place - self.eye[axis[a]])
             if a < last and given is not None:
                 across = across + 0.5 * (given[a] + own[a]) * (place - float(self.places[j, axis[a]]))
-        self._count(i, j, k, flag)
-        return j
 
     def _plane(self, i: int, j: int, axis: Sequence[int]) -> list[float] | None:
         """The slopes of the plane of component j: of the last axis of i along its others; None if it has none
         or is too steep."""
-        d, e, n = self.v["deviation"][i], self.v["deviation"][j], self.normals[j].tolist()
-        if i == 0 or e[-2] - e[-1] < 4 or d[-2] - d[-1] < 2:
+        d, e = self.v["deviation"][i], self.v["deviation"][j]
+        if e[-2] - e[-1] < 4 or d[-2] - d[-1] < 2:
             return None
-        upright = n[axis[self.last]]
-        if not abs(upright) > 0.25 * max(map(abs, n)):
+        return self._slopes(self.normals[j].tolist(), axis)
+
+    def _slopes(self, normal: Sequence[float], axis: Sequence[int]) -> list[float] | None:
+        """Those on the plane with this normal."""
+        upright = normal[axis[self.last]]
+        if not abs(upright) > 0.25 * max(map(abs, normal)):
             return None
-        slopes = [-n[a] / upright for a in axis[: self.last]]
+        slopes = [-normal[a] / upright for a in axis[: self.last]]
         return slopes if max(map(abs, slopes)) <= 2.0 else None
 
     def _shears(self, i: int, j: int, flag: int, given: list[float] | None) -> tuple[list[float], int]:
         """Code the shears; returns the slopes of the last axis, and how far they are from those given, in
         steps."""
-        c, last = self.c, self.last
+        c, last, is_round = self.c, self.last, self.is_round
         d, e, shear = self.v["deviation"][i], self.v["deviation"][j], self.v["shear"][i]
         slopes, own, turn, off = given or [0.0, 0.0], [0.0, 0.0], 0.0, 0
 
         def value(pair: int, row: int, column: int) -> float:
-            found = shear[pair] * math.ldexp(1, (d[row] - d[column]) // 4 - 2)
+            found = shear[pair] * math.ldexp(1, self._step(d[row] - d[column]))
             _require(abs(found) <= STEEPEST)
             return found
 
@@ -314,15 +369,19 @@ class _Walk:
             finer = -((d[1] - d[0]) // 4)
             shear[0] = c.whole(self._slots("TURN", flag * 8 + min(finer, 7)), shear[0])
             turn = value(0, 1, 0)
-            step = (d[2] - d[1]) // 4 - 2
-            fine, about = min(-step // 2, 6), math.floor(slopes[1] * math.ldexp(1, -step) + 0.5)
+            step = self._step(d[2] - d[1])
+            fine = min(-step // 2 + self.b.coarse, 6)
+            about = math.floor(slopes[1] * math.ldexp(1, -step) + 0.5)
             context = fine if given is None else 7 + fine * 3 + min((e[1] - e[2]) // 6, 2)
-            off = c.whole(self._slots("TILT", flag * 28 + context), shear[2] - about, _side(about))
+            context = 56 + (given is not None) * 7 + fine if is_round else flag * 28 + context
+            off = c.whole(self._slots("TILT", context), shear[2] - about, _side(about))
             shear[2] = about + off
             own[1] = value(2, 2, 1)
-        step = (d[last] - d[0]) // 4 - 2
+        step = self._step(d[last] - d[0])
+        fine = min(-step // 2 + self.b.coarse, 6)
         about = math.floor((slopes[0] + own[1] * turn) * math.ldexp(1, -step) + 0.5)
-        context = flag * 42 + (given is not None) * 21 + min(-step // 2, 6) * 3 + min(abs(off) // 2, 2)
+        context = 84 if is_round else flag * 42 + (given is not None) * 21
+        context += fine * 3 + min(abs(off) // 2, 2)
         pair = last - 1
         rest = c.whole(self._slots("SLOPE", context), shear[pair] - about, _side(about))
         shear[pair] = about + rest
@@ -336,7 +395,9 @@ class _Walk:
             area = [sum(deviation[t][: self.last]) for t in (i, j, k)]
             both = count[j] + count[k]
             about = ((both - area[1] - area[2] >> 1) + area[0] + (both >> 1)) >> 1
-        count[i] = about + self.c.whole(self._slots("COUNT", flag + 2 * (i == 0)), count[i] - about)
+        about = about // self.unit * self.unit
+        count[i] = about + self._whole(self._slots("COUNT", flag + 2 * (i == 0)), count[i] - about)
+        count[i] = NO_COUNT if count[i] == NO_COUNT - 1 and self.b.coarse else count[i]
         _require(NO_COUNT <= count[i] <= LARGEST_COUNT)
 
     def _viewpoints(self, i: int, j: int, begin: int) -> int:
@@ -375,6 +436,11 @@ class _Walk:
         if not c.writes:
             v["seen_from"][begin:end], v["share"][begin:end] = map(list, zip(*found, strict=True))
         return end
+
+
+def _sagitta(deviation: Sequence[int], distance: float) -> float:
+    """By how much a component with this distance from the origin is before the sphere of its points."""
+    return (math.ldexp(1, deviation[0] // 2) + math.ldexp(1, deviation[1] // 2)) / (2.0 * distance)
 
 
 def _side(about: int) -> int:

@@ -16,6 +16,10 @@ So, in the rounded component's deviations, a mean is off by at most 2⁻ᵖ⁻¹
 The deviation in any direction changes by −14 to +16 % in 2D, −19 to +24 % in 3D at most, for any shape of
 the component. Restored covariances are positive definite by construction. The lattice is fixed in the world
 frame: the result depends on the component only, and rounding again changes nothing.
+
+The *coarse lattice* is a part of this one: means and shears have 2^`COARSER` times the step, deviations and
+counts twice. So a mean is off by at most half a deviation along each axis, which is a twelfth of its variance
+on average, and each d_i by a factor of 2^(1/4) at most.
 """
 
 from __future__ import annotations
@@ -34,6 +38,9 @@ PER_OCTAVE = 4
 """Steps of deviations, and of counts, in a factor of two."""
 PRECISION = 2
 """Means and shears have at least 2^PRECISION steps in a deviation."""
+
+COARSER = 2
+"""Bits of the means and shears of the coarse lattice that are zero."""
 
 MEAN_ERROR = SHEAR_ERROR = 2.0 ** (-PRECISION - 1)
 """Largest error of a mean, and of a shear, in deviations."""
@@ -57,6 +64,7 @@ AXIS_ORDERS = {dim: torch.tensor(list(itertools.permutations(range(dim)))) for d
 # Literals and exact powers of two: the same bits on every machine.
 _ROOTS = torch.tensor([1.0, 1.189207115002721, 1.4142135623730951, 1.6817928305074292], dtype=torch.float64)
 _BOUNDS = torch.tensor([0.5946035575013605, 0.8408964152537145], dtype=torch.float64)  # 2^-3/4, 2^-1/4
+_COARSE_BOUNDS = torch.tensor([0.7071067811865476] * 2, dtype=torch.float64)
 _EXP2 = torch.tensor([2.0**e for e in range(-256, 256)], dtype=torch.float64)
 
 
@@ -125,26 +133,27 @@ class Lattice:
         return self.by_world_axis(mean), covariances
 
 
-def nearest(means: Tensor, covariances: Tensor) -> Lattice:
-    """The nearest lattice points of means (K, D) and covariances (K, D, D), float64 on the CPU.
+def nearest(means: Tensor, covariances: Tensor, coarse: bool = False) -> Lattice:
+    """The nearest lattice points of means (K, D) and covariances (K, D, D), float64 on the CPU; those of the
+    coarse lattice, if `coarse`.
 
     Covariances that are not positive definite become so. Raises `InvalidArgumentError`
     for values beyond `FARTHEST` and `LARGEST_DEVIATION`, also if only their rounding is: the result
     `is_valid`.
     """
     if is_fused(means, covariances):
-        found = lattice_rounding(means, covariances, _constants(means.shape[1]))
+        found = lattice_rounding(means, covariances, _constants(means.shape[1], coarse))
         if found is not None:
-            return Lattice(*found)
+            return Lattice(*found[:2], *(steps << COARSER * coarse for steps in found[2:]))
     _check(means, covariances)
-    exact, rows = _exact(means, covariances)
+    exact, rows = _exact(means, covariances, coarse)
     if len(rows) == len(means):
         return exact
     order = _pivots(covariances)
-    rounded = _rounded(means, covariances, order)
+    rounded = _rounded(means, covariances, order, coarse)
     # If several axis orders restore the same component, the first is used, so that rounding a rounded
     # component gives the same bytes.
-    earlier = _exact(*rounded.restored(), before=order)
+    earlier = _exact(*rounded.restored(), coarse, before=order)
     return _within_bounds(_replaced(_replaced(rounded, *earlier), exact, rows), means, covariances)
 
 
@@ -169,13 +178,13 @@ def floor_divide(values: Tensor, divisor: int) -> Tensor:
     return torch.div(values, divisor, rounding_mode="floor")
 
 
-def _constants(dim: int) -> LatticeConstants:
+def _constants(dim: int, coarse: bool = False) -> LatticeConstants:
     return LatticeConstants(
         orders=AXIS_ORDERS[dim],
         roots=_ROOTS,
-        bounds=_BOUNDS,
+        bounds=_COARSE_BOUNDS if coarse else _BOUNDS,
         per_octave=PER_OCTAVE,
-        precision=PRECISION,
+        precision=PRECISION - COARSER * coarse,
         least_deviation=LEAST_DEVIATION,
         largest_deviation=LARGEST_DEVIATION,
         largest_ratio=LARGEST_RATIO,
@@ -209,14 +218,16 @@ def _within_bounds(places: Lattice, means: Tensor, covariances: Tensor) -> Latti
     return places
 
 
-def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> tuple[Lattice, Tensor]:
+def _exact(
+    means: Tensor, covariances: Tensor, coarse: bool, before: Tensor | None = None
+) -> tuple[Lattice, Tensor]:
     """The components that are exactly on the lattice, in their first possible axis order, and their rows
     (J,) in rising order. `before` (K,): try only axis orders before these."""
     k, dim = means.shape
     # The variance of the first axis must be a lattice value: this excludes most orders.
     variances = covariances.diagonal(dim1=1, dim2=2)
     least, largest = LEAST_DEVIATION, LARGEST_DEVIATION
-    steps = _deviation_steps(variances.clamp_min(1e-300)).clamp(least, largest)
+    steps = _deviation_steps(variances.clamp_min(1e-300), coarse).clamp(least, largest)
     fits = (power(2 * steps) == variances)[:, AXIS_ORDERS[dim][:, 0]]  # (K, orders)
     if before is not None:
         fits &= torch.arange(fits.shape[1]) < before[:, None]
@@ -224,7 +235,7 @@ def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> 
     if not len(row):
         none = order.new_zeros(0, dim)
         return Lattice(order, none, order.new_zeros(0, dim * (dim - 1) // 2), none), order
-    tried = _rounded(means[row], covariances[row], order)
+    tried = _rounded(means[row], covariances[row], order, coarse)
     mean, covariance = tried.restored()
     same = (mean == means[row]).all(1) & (covariance == covariances[row]).flatten(1).all(1)
     same = (same & tried.is_valid()).nonzero().squeeze(1)
@@ -233,34 +244,35 @@ def _exact(means: Tensor, covariances: Tensor, before: Tensor | None = None) -> 
     return tried.taken(first[rows]), rows
 
 
-def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor) -> Lattice:
+def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor, coarse: bool) -> Lattice:
     """The nearest place with these axis orders (K,)."""
     dim = means.shape[1]
     axes = AXIS_ORDERS[dim][axis_order]
     mean = means.gather(1, axes)
     variances, shears = _factors(covariances[_pairs(axes)])
-    steps = _deviation_steps(variances)
+    steps = _deviation_steps(variances, coarse)
     steps = torch.maximum(steps, steps[:, :1] - LARGEST_RATIO).clamp_min(LEAST_DEVIATION)
     steps = steps.cummin(1).values  # equal deviations may differ by a rounding error
     blank = Lattice(axis_order, steps, steps.new_zeros(len(mean), shears.shape[1]), torch.zeros_like(steps))
 
     e = shear_exponents(steps)
-    shear = _to_shears(shears[:, :1], e[:, :1])
+    shear = _to_shears(shears[:, :1], e[:, :1], coarse)
     if dim == 3:
         # x₃ = L₃₁x₁ + L₃₂(x₂ − L₂₁x₁) + …, written with the rounded L₂₁.
         off = scaled(shear[:, 0], e[:, 0]) - shears[:, 0]
         given = torch.stack([shears[:, 1] + shears[:, 2] * off, shears[:, 2]], 1)
-        shear = torch.cat([shear, _to_shears(given, e[:, 1:])], 1)
+        shear = torch.cat([shear, _to_shears(given, e[:, 1:], coarse)], 1)
 
     slope = scaled(shear, e)
     step = blank.mean_exponents()
-    place = [_to_steps(mean[:, 0], step[:, 0])]
+    place = [_to_steps(mean[:, 0], step[:, 0], coarse)]
     error = mean[:, 0] - scaled(place[0], step[:, 0])
     wanted = mean[:, 1] - slope[:, 0] * error
-    place.append(_to_steps(wanted, step[:, 1]))
+    place.append(_to_steps(wanted, step[:, 1], coarse))
     if dim == 3:
         rest = wanted - scaled(place[1], step[:, 1])
-        place.append(_to_steps(mean[:, 2] - slope[:, 1] * error - slope[:, 2] * rest, step[:, 2]))
+        rest = mean[:, 2] - slope[:, 1] * error - slope[:, 2] * rest
+        place.append(_to_steps(rest, step[:, 2], coarse))
     return Lattice(axis_order, steps, shear, torch.stack(place, 1).long())
 
 
@@ -302,20 +314,22 @@ def _pivots(covariances: Tensor) -> Tensor:
     return chosen.long().argmax(1)
 
 
-def _deviation_steps(variances: Tensor) -> Tensor:
+def _deviation_steps(variances: Tensor, coarse: bool) -> Tensor:
     """The nearest log2 of deviations in steps; without a logarithm, whose last bit depends on the machine."""
     mantissa, exponent = torch.frexp(variances)
-    return (exponent.long() - 1) * (PER_OCTAVE // 2) + torch.bucketize(mantissa, _BOUNDS, right=True)
+    return (exponent.long() - 1) * (PER_OCTAVE // 2) + torch.bucketize(
+        mantissa, _COARSE_BOUNDS if coarse else _BOUNDS, right=True
+    )
 
 
-def _to_steps(values: Tensor, exponents: Tensor) -> Tensor:
-    """Values in whole steps of 2^exponent, still float64."""
-    return (values * _EXP2[256 - exponents]).round()
+def _to_steps(values: Tensor, exponents: Tensor, coarse: bool) -> Tensor:
+    """Values in whole steps of 2^exponent, still float64; whole steps of the coarse lattice, if `coarse`."""
+    return (values * _EXP2[256 - exponents - COARSER * coarse]).round() * 2.0 ** (COARSER * coarse)
 
 
-def _to_shears(values: Tensor, exponents: Tensor) -> Tensor:
+def _to_shears(values: Tensor, exponents: Tensor, coarse: bool) -> Tensor:
     """Shears in whole steps, limited to `STEEPEST`; only indefinite covariances exceed it."""
-    return _to_steps(values.clamp(-STEEPEST, STEEPEST), exponents).long()
+    return _to_steps(values.clamp(-STEEPEST, STEEPEST), exponents, coarse).long()
 
 
 def _pairs(axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:

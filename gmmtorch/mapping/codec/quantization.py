@@ -116,22 +116,27 @@ class Quantized:
         )
 
 
-def quantize(components: Components) -> Quantized:
-    """The components rounded to whole numbers.
+def quantize(components: Components, coarse: bool = False) -> Quantized:
+    """The components rounded to whole numbers; those of the coarse lattice, if `coarse`.
 
     Viewpoints are sorted by component, then by the coordinates of the origin. Origins that round to the same
     place become one; origins without a viewpoint are dropped. Raises `InvalidArgumentError` for values that
     are too large to be stored, see `lattice` and `LARGEST_COUNT`.
     """
     c = components.on_cpu()
-    return _quantized(c, lattice.nearest(c.means.double(), c.covariances.double()))
+    return _quantized(c, lattice.nearest(c.means.double(), c.covariances.double(), coarse), coarse=coarse)
 
 
 def _quantized(
-    c: Components, places: Lattice, rows: Ints | None = None, ids: Ints | None = None
+    c: Components,
+    places: Lattice,
+    rows: Ints | None = None,
+    ids: Ints | None = None,
+    coarse: bool = False,
 ) -> Quantized:
     """`quantize` of components at these places, on the CPU; in the order of `rows` (K,), with these ids."""
     count, flags = _support_steps(c.support.double()), c.max_range
+    count = coarse_counts(count) if coarse else count
     by, seen, counts = c.seen_by.numpy(), c.seen_from.numpy(), c.seen_count.numpy().astype(np.float64)
     shapes, attributes = [value.numpy() for value in vars(places).values()], c.attributes
     if attributes:
@@ -166,9 +171,15 @@ def _quantized(
     return Quantized(Lattice(*made), *values)
 
 
-def quantized(components: Components) -> Components:
-    """The components after writing and reading them, on their device, without writing bits."""
-    return quantize(components).restored().to(components.means.device)
+def quantized(components: Components, coarse: bool = False) -> Components:
+    """The components after writing and reading them, on their device, without writing bits; those of the
+    coarse lattice, if `coarse`, which take a third fewer bytes."""
+    return quantize(components, coarse).restored().to(components.means.device)
+
+
+def coarse_counts(steps: Ints) -> Ints:
+    """The nearest even steps of counts, or `NO_COUNT`."""
+    return np.where(steps == NO_COUNT, steps, np.rint(steps / 2).astype(np.int64) * 2)
 
 
 def _support_steps(support: Tensor) -> Ints:

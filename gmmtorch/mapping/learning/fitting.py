@@ -270,13 +270,11 @@ class SurfaceFit:
     rule: MixtureRule = field(default_factory=MixtureRule)
 
 
-def fit_window(
-    scans: Sequence[Scan], fit: SurfaceFit, viewpoints: AssignViewpoints, empty_fit: SurfaceFit | None = None
-) -> Components:
+def fit_window(scans: Sequence[Scan], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
     """Components of the returns of S scans, then `max_range` components of the ends of no-return beams.
 
-    `empty_fit`: for the no-return beams, if it differs from `fit`. `fit.rule.free_points` points on each
-    other beam are treated as ends of no-return beams. Components are not numbered, and on the CPU.
+    `fit.rule.free_points` points on each other beam are treated as ends of no-return beams. Components are
+    not numbered, and on the CPU.
     """
     origins = torch.stack([scan.origin.double() for scan in scans])
     channels = [scan.attributes for scan in scans]
@@ -287,7 +285,7 @@ def fit_window(
         ends = [torch.cat([scan.no_return, _points_before(scan, n_free)]) for scan in scans]
     if not any(len(end) for end in ends):
         return returns
-    empty = fit_points(ends, origins, empty_fit or fit, viewpoints, max_range=True)
+    empty = fit_points(ends, origins, fit, viewpoints, max_range=True)
     return Components.concatenate([returns, empty])
 
 
@@ -322,13 +320,13 @@ def fit_points(
         return Components.empty(dim)
     points = torch.cat(list(clouds)).double()
     if (places := _places_apart(points, _WIDEST * fit.noise)) is not None:
-        parts = []
+        made = []
         for number in range(int(places.max()) + 1):
             kept = [place == number for place in places.split(sizes)]
             some = [cloud[rows] for cloud, rows in zip(clouds, kept, strict=True)]
             own = [{k: v[rows] for k, v in a.items()} for a, rows in zip(attributes, kept, strict=False)]
-            parts.append(fit_points(some, origins, fit, viewpoints, own, max_range=max_range))
-        return Components.concatenate(parts).with_used_origins()
+            made.append(fit_points(some, origins, fit, viewpoints, own, max_range=max_range))
+        return Components.concatenate(made).with_used_origins()
     ends = torch.tensor(sizes).cumsum(0).to(origins.device, non_blocking=True)
     scan = torch.bucketize(torch.arange(n_points, device=ends.device), ends, right=True)
     center = points.mean(0)

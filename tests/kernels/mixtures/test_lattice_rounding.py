@@ -21,9 +21,9 @@ from gmmtorch.mapping.codec.lattice import Lattice
 pytestmark = pytest.mark.cpu_only
 
 
-def rounded_by_both(means: Tensor, covariances: Tensor) -> Lattice:
+def rounded_by_both(means: Tensor, covariances: Tensor, coarse: bool = False) -> Lattice:
     """The lattice points of the fused kernel, after a comparison with those of the twin."""
-    twin, fused = by_both(lambda: lattice.nearest(means, covariances))
+    twin, fused = by_both(lambda: lattice.nearest(means, covariances, coarse))
     for field in fields(Lattice):
         assert torch.equal(getattr(fused, field.name), getattr(twin, field.name)), field.name
     with kernels("torch"):
@@ -41,8 +41,9 @@ def rounded_by_both(means: Tensor, covariances: Tensor) -> Lattice:
     center=st.sampled_from([0.0, -3.7, 4.2e6]),
     deviations=st.sampled_from([(1e-9, 1e4), (5e-3, 1.0), (0.1, 0.1), (20.0, 5e3)]),
     shape=st.sampled_from(["any", "indefinite", "along the axes", "flat", "zero"]),
+    coarse=st.booleans(),
 )
-def test_rounded_components_are_those_of_the_twin_to_the_bit(k, dim, seed, center, deviations, shape):
+def test_rounded_components_are_those_of_the_twin_to_the_bit(k, dim, seed, center, deviations, shape, coarse):
     drawn = random_components(
         dim, k, seed, center=center, extent=30.0, deviations=deviations, counts=(1.0, 100.0), n_origins=3
     )
@@ -56,8 +57,8 @@ def test_rounded_components_are_those_of_the_twin_to_the_bit(k, dim, seed, cente
         covariances = covariances[:, :, :1] @ covariances[:, :1, :] / covariances[:, :1, :1].clamp_min(1e-30)
     elif shape == "zero":
         covariances = torch.zeros_like(covariances)
-    once = rounded_by_both(means, covariances)
-    again = rounded_by_both(*once.restored())
+    once = rounded_by_both(means, covariances, coarse)
+    again = rounded_by_both(*once.restored(), coarse)
     assert all(torch.equal(getattr(once, f.name), getattr(again, f.name)) for f in fields(Lattice))
 
 

@@ -26,8 +26,6 @@ _MOST_ROBOTS = 31
 """Bits of the integer that stores which robots saw a cell."""
 _LATE_JITTERS = 5
 """Mean jitters. Less than 1 % of the datagrams arrive later."""
-_EMPTY_LENGTH = 2 / 3
-"""Length of components of free space, as a share of that of surfaces."""
 _FLAT = 0.5
 """Thickness of a flat piece, as a share of `FrameRule.side`."""
 
@@ -133,7 +131,7 @@ class FrameRule:
             raise InvalidArgumentError(f"update_at={self.update_at} must be at least 1, and finite.")
 
     def surface_fit(self) -> SurfaceFit:
-        """How the returns of a frame become components."""
+        """How the returns of a frame, and the ends of its no-return beams, become components."""
         from gmmtorch.mapping import cell_fit
         from gmmtorch.mixture import least_support
 
@@ -143,10 +141,6 @@ class FrameRule:
             fit.flatness, thickness=_FLAT * self.side, min_weight=least, min_weight_thick=_FLAT * least
         )
         return replace(fit, flatness=flat)
-
-    def empty_fit(self) -> SurfaceFit:
-        """The same for no-return beams: finer, because they end at the edges of the field of view."""
-        return replace(self, length=_EMPTY_LENGTH * self.length).surface_fit()
 
 
 @dataclass(frozen=True)
@@ -183,7 +177,7 @@ class TeamOptions(LinkConditions):
     planning_prior: occupancy of unobserved cells in the information of a view.
     window: cells along x, y and z of the local map around a robot, for planning, at least: it contains what
     the camera sees.
-    codec: of components: quantized (about 6 bytes each), float, or thesis (57 bytes), see `CODECS`.
+    codec: of components: quantized (about 4.5 bytes each), float, or thesis (57 bytes), see `CODECS`.
     margin: metres between robots. device: of the maps, of learning, and of the information of views; sensing,
     planning and messages are on the CPU. A robot plans once every `dynamics.duration`.
     """

@@ -24,6 +24,7 @@ from gmmtorch.mapping import (
     count_explained,
     explained_within,
     fit_window,
+    quantized,
     summed,
 )
 from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence, cone_bounds, intersection
@@ -310,8 +311,10 @@ class GmmMapper(Mapper):
             learned = novel & ~self._count(frame, novel.nonzero().squeeze(1), 1)
         if rule.update_stride is not None:
             self._count(frame, (~novel).nonzero().squeeze(1)[:: rule.update_stride], rule.update_stride)
-        components = self._learned(frame, learned)
-        self.shared.add(components.to("cpu"))  # where messages are encoded
+        components = self._learned(frame, learned).to("cpu")  # where messages are encoded
+        if isinstance(self.shared, Replica):
+            components = quantized(components, coarse=True)
+        self.shared.add(components)
         self._n_frames += 1
         if self._n_frames % rule.update_every == 0:
             self.shared.count(self._due)
@@ -329,8 +332,8 @@ class GmmMapper(Mapper):
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
         """The components of the novel beams."""
         scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
-        fits = self._rule.surface_fit(), all_origins(), self._rule.empty_fit()
-        return fit_window([scan], *fits).to(frame.ends.device)
+        found = fit_window([scan], self._rule.surface_fit(), all_origins())
+        return found.to(frame.ends.device)
 
     def _count(self, frame: DepthFrame, chosen: Tensor, weight: int) -> Tensor:
         """Adds the beams `chosen` (M,) to the counts of the components that explain them, with a weight each;

@@ -1,7 +1,7 @@
-"""Batches of version 1 in base 85, and the BLAKE2b digests (16 bytes) of the fields decoded from them, as
-gmmtorch wrote and read them before version 2 of batches."""
+"""Batches in base 85, and the BLAKE2b digests (16 bytes) of the fields decoded from them: of version 1 as
+gmmtorch wrote and read them before version 2 of batches, and one each of versions 2 and 4."""
 
-FIRST_VERSION = {
+EARLIER = {
     "flat": (
         "0R$KhAwU2C002S0ZFUgShk#H4y9_K{hb~|gyi82c1dax4sUR%K4Zsqw5Dagn2n?4D{DDi9K6+T%h>Riq5y(<)Pj~%Z"
         "2-rR}rg?P?2!^QATSXxESpfhDL;xkHr9i+j2E~fX2qY_YmLq^UsB#Vm#bW{z%~!;n@5^n+BRPc|TWR)UfR}dj%D}mS"
@@ -25,4 +25,13 @@ FIRST_VERSION = {
         "cae66941d9efbd404e4d88758ea67670",
     ),
     "one": ("0R#dB0000000w{q0s+&2g1~?P00KY&004jh002N7OxXETL;3)m0JgD}1p", "a9d2bb542e9f8557cec1dccd0d1e63c5"),
+    "version 2": (
+        "0>CIRC;$ml+dt}c?$*A}CGUr4!O=aW1*e0jX<HJkz?OFxlkk5Q<fiI8uROXa8OwCi367@gujC>R`@_}mdzpTpuSOzY"
+        "^E+-niy-WM9r@9r5rfzU=@||tpHa@<1IUHUXYn`0jvL{zbya_npE&+A&8RI!OuP",
+        "0addb3f5c4392b357e04ea6ac417ebf7",
+    ),
+    "version 4": (
+        "1js-L003H@U&oTT@<w`y7c9>c$-4dbWrO;bcxM)ziZW0JP%FmcrWOtp#D2>kIlG|Jd#n-J+pdww){iEje4X}5LaT(H!|)j",
+        "bba5c28e77a767b9c90e00f1991439ca",
+    ),
 }
