@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gmmtorch.export import bag
-from gmmtorch.export.bag import cloud_fields, odometry_fields
+from gmmtorch.export import bag, cloud_fields, odometry_fields
 from gmmtorch.scan import ArrayLike
 
 

@@ -26,10 +26,8 @@ from command_runs import (
 )
 
 import gmmtorch
+from gmmtorch import GaussianMap, GaussianMixture, OccupancyGrid
 from gmmtorch.experiments.studies import ComponentCountStudy, InitializationStudy, SensorModelStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
 
 Run = Callable[..., Finished]
 OCCUPANCY_FIELDS = {

@@ -17,17 +17,14 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from gmmtorch import datasets
-from gmmtorch.cli import build, common, export, inputs, localize, options_help
-from gmmtorch.cli.inputs import open_dataset
+from gmmtorch import GaussianMap, IncrementalRule, NoveltyRule, WindowedRule, datasets
+from gmmtorch.cli import build, common, export, inputs, localize, open_dataset, options_help
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import studies as study_cases
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
 from gmmtorch.experiments.cli.fit_runs import fit_options
 from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.team.cli import from_options
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions

@@ -15,8 +15,7 @@ import torch
 from sensor_bags import BagWriter
 from test_rosbag import POINTS, moved
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch.datasets import TransformTree, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 Sample = tuple[int, np.ndarray, np.ndarray]

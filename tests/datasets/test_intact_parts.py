@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_rosbag import moved
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.ros.bag_reader import BagReader
+from gmmtorch.datasets import BagReader, load
 from gmmtorch.errors import DataError
 
 pytest.importorskip("rosbags")

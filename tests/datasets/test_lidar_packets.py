@@ -9,15 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from packet_files import (
-    PIXELS,
-    SHAPES,
-    frames,
-    hesai_packet,
-    ouster_metadata,
-    ouster_packet,
-    write_capture,
-)
+from packet_files import PIXELS, SHAPES, frames, hesai_packet, ouster_metadata, ouster_packet, write_capture
 from test_more_sensors import packet as velodyne_packet
 from test_rosbag import drive, moved
 

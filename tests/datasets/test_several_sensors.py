@@ -11,8 +11,7 @@ import torch
 from gmmtorch import GaussianMap
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.localization import Tracker, with_odometry
-from gmmtorch.localization.tracker import locate_scans
+from gmmtorch.localization import Tracker, locate_scans, with_odometry
 from gmmtorch.mapping import MapBuilder
 
 pytest.importorskip("rosbags")

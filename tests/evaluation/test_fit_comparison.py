@@ -19,9 +19,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS, FitOutcome, Views, compare, means, split
 from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.mixture.estimators.sensor_model import measured_sensor
-from gmmtorch.mixture.prune_options import PruneOptions
-from gmmtorch.mixture.pruning import prune
+from gmmtorch.mixture import PruneOptions, measured_sensor, prune
 from gmmtorch.report import ignore
 
 SMALL = FitOptions(n_components=6, max_iter=60)

@@ -16,18 +16,8 @@ from sklearn.metrics import brier_score_loss, log_loss, roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.metrics import (
-    SeenPredictions,
-    auc_gain,
-    auc_interval,
-    psnr2,
-    psnr_terms,
-    reliability,
-    roc,
-    scores,
-    unknown_scores,
-)
-from gmmtorch.experiments.evaluation.queries import hit_and_free
+from gmmtorch.experiments.evaluation import auc_gain, auc_interval, hit_and_free, reliability, roc
+from gmmtorch.experiments.evaluation.metrics import SeenPredictions, psnr2, psnr_terms, scores, unknown_scores
 from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, reliability_of, scores_of
 from gmmtorch.scan import Scan
 

@@ -8,10 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.robot_camera import DepthCamera
-from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.world.world import World
+from gmmtorch.simulation import DepthCamera, box
+from gmmtorch.team.exploration import TeamOptions, World
 
 SMALL = TeamOptions(
     size=2,

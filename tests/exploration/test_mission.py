@@ -21,8 +21,7 @@ from pretended_gpu import GPUTensor, pretended_gpu
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.robot_camera import DepthCamera
+from gmmtorch.simulation import DepthCamera, box
 from gmmtorch.team.cli.explorations import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission
@@ -33,11 +32,7 @@ from gmmtorch.team.exploration.mission.trials import assemble, make_agent, start
 from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories
 from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.link_conditions import Partition
-from gmmtorch.team.sharing.transport.udp import UdpTransport
+from gmmtorch.team.sharing import Partition, PlanMessage, Replica, Store, UdpTransport, encode_plan
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits

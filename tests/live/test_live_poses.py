@@ -11,19 +11,13 @@ import torch
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import Topic
-from gmmtorch.datasets.ros.bag_topics import LASER, Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch import GaussianMap, Scan
+from gmmtorch.datasets import LASER, Ranges, Sensor, Topic, TransformTree, load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.bag import transform_fields
-from gmmtorch.live import live_scans, publishers
-from gmmtorch.live.live_mapper import LiveLocalizer, LiveMapper
-from gmmtorch.live.live_scans import LiveOptions, LiveScans
-from gmmtorch.live.ros import Node, Quality
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.scan import Scan
+from gmmtorch.live import LiveLocalizer, LiveMapper, LiveScans, Node, live_scans, publishers
+from gmmtorch.live.live_scans import LiveOptions
+from gmmtorch.live.ros import Quality
 
 N_BEAMS = 180
 ANGLES = np.linspace(-np.pi, np.pi, N_BEAMS, endpoint=False)

@@ -13,11 +13,7 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from sensor_bags import BagWriter
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import BagReader, Topic
-from gmmtorch.datasets.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch.datasets import CLOUD, DEPTH, LASER, BagReader, Ranges, Sensor, Topic, TransformTree, load
 from gmmtorch.errors import told
 from gmmtorch.live import live_scans
 from gmmtorch.live.live_scans import DROPPED, LiveOptions, LiveScans

@@ -8,8 +8,7 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Attributes, Components, Labels, Numbers
 
 
 def rotations(k: int, dim: int, generator: torch.Generator) -> Tensor:

@@ -17,12 +17,9 @@ from torch import Tensor
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import TENSORS, Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
+from gmmtorch.mapping import Components, GaussianMap, IncrementalRule, NoveltyRule, WindowedRule, quantized
+from gmmtorch.mapping.components import TENSORS
+from gmmtorch.occupancy import OccupancyGrid, VoxelGrid
 from gmmtorch.scan import Scan
 
 BUFFERS = sorted(TENSORS)

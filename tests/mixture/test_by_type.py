@@ -15,12 +15,10 @@ from torch.utils._pytree import tree_leaves
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import GmmTorchError, NumericalError
-from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture import INITIALIZATIONS, GaussianMixture, Parameters, fit_stream, initialize
 from gmmtorch.mixture.em import by_type, loop
-from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, constrain, expand, type_shape
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, constrain, expand, type_shape
 from gmmtorch.mixture.reduction import merge_pairs
-from gmmtorch.mixture.streaming import fit_stream
 
 types = pytest.mark.parametrize("kind", COVARIANCE_TYPES)
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

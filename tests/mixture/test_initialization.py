@@ -20,21 +20,20 @@ from sklearn.datasets import load_digits, load_iris
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import initialization
-from gmmtorch.mixture.em import kmeans as module
-from gmmtorch.mixture.em.exact import Parameters, quadratic_features
-from gmmtorch.mixture.em.initialization import (
+from gmmtorch.mixture import (
     INITIALIZATIONS,
-    distinct,
-    flat_pieces,
+    GaussianMixture,
+    Parameters,
     initialize,
-    moments_of,
-    replicated,
+    least_support,
+    pool_into_cells,
     surface_pieces,
 )
+from gmmtorch.mixture.em import initialization
+from gmmtorch.mixture.em import kmeans as module
+from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.em.initialization import distinct, flat_pieces, moments_of, replicated
 from gmmtorch.mixture.em.kmeans import kmeans, spread_out
-from gmmtorch.mixture.em.partition import least_support, pool_into_cells
 
 METHODS = sorted(INITIALIZATIONS)
 SEEDED = [method for method in METHODS if method != "flat_pieces"]

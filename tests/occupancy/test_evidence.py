@@ -88,9 +88,8 @@ def test_entropy_equals_scipys_bernoulli(theta):
     assert float(bernoulli_entropy(value)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_methods_of_evidence_equal_the_functions():
+def test_methods_of_evidence_equal_the_functions(generator):
     grid = GRIDS[2]
-    generator = torch.Generator().manual_seed(0)
     evidence = Evidence(grid, *(5 * torch.rand(2, *grid.shape, generator=generator, dtype=torch.float64)))
     theta = (evidence.hits + 2) / (evidence.hits + evidence.misses + 4)
     torch.testing.assert_close(evidence.probability(2), theta)

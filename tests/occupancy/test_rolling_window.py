@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, sum_evidence
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence, sum_evidence
 
 SHAPE = (12, 16, 10)
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))

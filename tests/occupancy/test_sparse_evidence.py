@@ -13,10 +13,8 @@ from occupancy.exact_dda import voxels_crossed, voxels_left
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import Box, CellEvidence, Evidence, SparseEvidence, VoxelGrid
+from gmmtorch.occupancy.grid import BYTES_PER_CELL
 
 RESOLUTION = 0.125
 Cell = tuple[int, ...]

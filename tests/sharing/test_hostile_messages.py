@@ -19,11 +19,8 @@ from sharing.message_examples import channel_examples, examples, forged, sealed
 from sharing.structured_bodies import structured
 
 from gmmtorch.errors import DataError
+from gmmtorch.mapping import LARGEST_VARIANCE, MOST_POINTS, BitWriter, Components
 from gmmtorch.mapping.codec import component_batch as batches
-from gmmtorch.mapping.codec.bitstream import BitWriter
-from gmmtorch.mapping.codec.lattice import LARGEST_VARIANCE
-from gmmtorch.mapping.codec.quantization import MOST_POINTS
-from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing.messages import message_registry
 from gmmtorch.team.sharing.messages.component_messages import (
     MOST_COMPONENTS_SENT,
