@@ -263,8 +263,10 @@ def test_small_batches_reach_the_optimum_in_few_epochs():
 # -- the map ---------------------------------------------------------------------------------------------
 
 
-def test_hilbert_map_rejects_a_lattice_with_gaps():
-    made = HilbertMap(length=0.1, spacing=0.5)
+@pytest.mark.parametrize(
+    "made", [HilbertMap(length=0.1, spacing=0.5), BayesianHilbertMap(100.0, spacing=1.0)]
+)
+def test_lattices_and_hinges_with_gaps_are_rejected(made):
     with pytest.raises(InvalidArgumentError, match="gaps"):
         made.insert(wall_scan(2))
 
@@ -478,11 +480,6 @@ def test_full_covariance_rejects_too_many_hinges(monkeypatch):
     monkeypatch.setattr("gmmtorch.experiments.baselines.hilbert_map._MAX_FULL", 10)
     with pytest.raises(MemoryLimitError, match="mean_field"):
         full_map().insert(wall_scan(2))
-
-
-def test_bayesian_hilbert_map_rejects_hinges_with_gaps():
-    with pytest.raises(InvalidArgumentError, match="gaps"):
-        BayesianHilbertMap(100.0, spacing=1.0).insert(wall_scan(2))
 
 
 def test_damaged_files_of_a_full_covariance_are_refused(tmp_path):

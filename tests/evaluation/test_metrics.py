@@ -89,13 +89,10 @@ def test_interval_matches_resampling_of_single_points(levels):
     assert high - low == pytest.approx(expected[1] - expected[0], rel=0.12)
 
 
-def test_interval_depends_only_on_the_seed():
+def test_interval_depends_only_on_the_seed_and_that_of_equal_scores_is_a_point():
     occupied, free = probabilities(200, 0.7, 0), probabilities(200, 0.0, 1)
     assert interval(occupied, free, seed=1) == interval(occupied, free, seed=1)
     assert interval(occupied, free, seed=1) != interval(occupied, free, seed=2)
-
-
-def test_interval_of_equal_scores_is_a_point():
     half = torch.full((30,), 0.5)
     assert interval(half, half) == (0.5, 0.5, 0.5)
 
@@ -181,12 +178,8 @@ def test_psnr_terms_separate_missing_from_extra_points(generator):
     assert forward == math.inf
     assert backward < 0
     assert psnr2(points, points[:20]) == math.inf
-
-
-def test_psnr2_of_a_single_point_is_infinite():
-    point = torch.tensor([[1.0, 2.0, 3.0]])
-    assert psnr2(point, point) == math.inf
-    assert psnr2(point, point + 1) == -math.inf
+    assert psnr2(points[:1], points[:1]) == math.inf
+    assert psnr2(points[:1], points[:1] + 1) == -math.inf
 
 
 def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:

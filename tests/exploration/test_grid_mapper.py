@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from exploration.mapped_room import heard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -14,7 +15,7 @@ from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.team.sharing import PointsMessage, ReceivedMessage, decode
+from gmmtorch.team.sharing import PointsMessage, decode
 from gmmtorch.team.sharing.broadcast import MOST_INTERVALS
 from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM, encode_points
 
@@ -159,10 +160,6 @@ def beams(*frames: DepthFrame) -> list[tuple[Tensor, Tensor, Tensor]]:
 
 def believed(one: GridMapper) -> Tensor:
     return torch.stack(one.belief.grid.dense(BOX))
-
-
-def heard(*datagrams: bytes, sender: int = 1) -> list[ReceivedMessage]:
-    return [ReceivedMessage(sender, datagram, decode(datagram)) for datagram in datagrams]
 
 
 def said(view: DepthFrame, sender: int = 1, number: int = 0) -> list[bytes]:

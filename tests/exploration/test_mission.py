@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from exploration.replays import FakeTime, Together
-from exploration.rooms import SHELF, SMALL, room, small_room, without_seconds
+from exploration.rooms import SHELF, SMALL, plan_ahead, room, small_room, without_seconds
 from kernels_of_gpu import kernels_of_gpu
 from mapping.map_cases import assert_same_components
 from pretended_gpu import GPUTensor, pretended_gpu
@@ -301,13 +301,6 @@ def hall() -> World:
     return small_room()
 
 
-def plan(n: int, step: float = 0.2, sender: int = 1) -> PlanMessage:
-    """A plan of n poses along x, one metre apart."""
-    path = torch.zeros(n, 4, dtype=torch.float64)
-    path[:, 0] = torch.arange(1, n + 1)
-    return PlanMessage(sender, 0, 0.0, step, path, torch.zeros(0, 4))
-
-
 def test_two_processes_hold_the_map_of_one_process_that_received_everything(hall, tmp_path, monkeypatch):
     fake, observer = FakeTime(), Replica(9, dim=3)
     clock = WallClock(clock=fake, sleep=fake.sleep)
@@ -373,7 +366,7 @@ def planned_beside(
 
 def test_a_robot_avoids_the_paths_that_it_has_heard(hall, monkeypatch):
     with transports(1) as (link,):
-        heard = [plan(10, sender=4), plan(3, sender=2)]
+        heard = [plan_ahead(10, sender=4), plan_ahead(3, sender=2)]
         seen = planned_beside(mission_of(0, hall, TEAM, link), heard, 0.4, monkeypatch)
     ahead = torch.tensor([[3.0] * 8, [3, 4, 5, 6, 7, 8, 9, 10]], dtype=torch.float64)
     assert torch.allclose(seen["peers"].paths[..., 0], ahead)
@@ -397,7 +390,7 @@ def test_views_are_sent_once_every_planning_period(hall, monkeypatch):
 
 def test_a_duplicate_id_is_reported_with_its_address(hall, monkeypatch):
     monkeypatch.setattr("gmmtorch.team.sharing.transport.security.FRESH_SECONDS", 0.1)
-    path = plan(4).path
+    path = plan_ahead(4).path
     with UdpTransport.unicast(0) as link, UdpTransport.unicast(0, peers=[link.address]) as other:
         mission = mission_of(0, hall, TEAM, link)
         view = FlyingRobotView(mission, link)

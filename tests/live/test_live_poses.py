@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from sensor_bags import moved
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
@@ -46,16 +47,9 @@ def laser(stamp: float, ranges: np.ndarray) -> dict[str, Any]:
     return {"header": header, **about, "time_increment": 0.0, "ranges": ranges.astype(np.float32)}
 
 
-def pose(x: float, y: float, yaw: float) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    matrix[:2, 3] = x, y
-    return matrix
-
-
 DRIVE = [(1.5 + 0.1 * i, 1.5 + 0.03 * i, 0.05 * i) for i in range(12)]
 PATH = DRIVE[:8]
-FIRST = pose(*DRIVE[0])
+FIRST = moved(*DRIVE[0][:2], yaw=DRIVE[0][2])
 
 
 def live(tree: TransformTree, **options: Any) -> LiveScans:
@@ -82,7 +76,7 @@ def node(ros_options):
 
 def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypatch):
     monkeypatch.setattr(live_scans, "SETTLING", 0.0)
-    odom_in_map = pose(1.0, 0.5, 0.3)
+    odom_in_map = moved(1.0, 0.5, yaw=0.3)
     scans = live(node.transforms, poses="tf", frame="odom")
     sent: dict[str, list[Any]] = {"pose": [], "/tf": [], "/diagnostics": []}
     monkeypatch.setattr(
@@ -90,7 +84,7 @@ def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypa
     )
     localizer = LiveLocalizer(node, scans, known)
     for index, at in enumerate(PATH):
-        in_odom = np.linalg.inv(odom_in_map) @ pose(*at)
+        in_odom = np.linalg.inv(odom_in_map) @ moved(*at[:2], yaw=at[2])
         message = transform_fields({("odom", "laser"): in_odom})
         message["transforms"][0]["header"]["stamp"] = {"sec": index, "nanosec": 0}
         node.transforms.add(message, static=False)
@@ -138,7 +132,7 @@ def test_a_map_of_another_dimension_is_refused(node):
 
 def is_near(found: np.ndarray, at: tuple[float, float, float]) -> bool:
     """Whether a pose in the frame of the first scan is that of the path, to 3 cm and 1.5°."""
-    off = np.linalg.inv(FIRST @ found) @ pose(*at)
+    off = np.linalg.inv(FIRST @ found) @ moved(*at[:2], yaw=at[2])
     return bool(np.linalg.norm(off[:2, 3]) < 0.03 and abs(np.arctan2(off[1, 0], off[0, 0])) < 0.026)
 
 

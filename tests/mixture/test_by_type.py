@@ -9,9 +9,8 @@ import pytest
 import scipy.special
 import sklearn.mixture
 import torch
+from kernels.twins import Largest
 from mixture.mixture_cases import random_parameters, scipy_log_joint
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import GmmTorchError, NumericalError
@@ -155,19 +154,6 @@ def test_the_density_and_the_responsibilities_have_gradients(kind, dim):
         return mixture(points), mixture.predict_proba(points)
 
     assert torch.autograd.gradcheck(ask, (points, means.clone().requires_grad_()))
-
-
-class Largest(TorchDispatchMode):
-    """The entries of the largest tensor that an operation makes."""
-
-    entries = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(result):
-            if isinstance(leaf, torch.Tensor) and not leaf._is_view():
-                self.entries = max(self.entries, leaf.numel())
-        return result
 
 
 @types

@@ -55,9 +55,6 @@ def test_integers_lists_and_half_precision_are_accepted():
     assert gmm.score_samples(x.half()).dtype == torch.float16
 
 
-# -- frames ----------------------------------------------------------------------------------------
-
-
 # -- starts ----------------------------------------------------------------------------------------
 
 

@@ -75,10 +75,18 @@ def test_occupancy_with_prior_zero_is_the_share_of_hits():
     assert theta.tolist() == [0.75, 0.0, 1.0]
 
 
-@pytest.mark.parametrize("prior", [-1, float("nan"), float("inf")])
-def test_invalid_priors_are_refused(prior):
-    with pytest.raises(InvalidArgumentError, match="prior"):
-        occupancy_probability(torch.ones(1), torch.ones(1), prior)
+@pytest.mark.parametrize(
+    ("name", "make", "values"),
+    [
+        ("prior", lambda x: occupancy_probability(torch.ones(1), torch.ones(1), x), (-1, math.nan, math.inf)),
+        ("variance_threshold", lambda x: classify(torch.tensor([0.5]), x), (0, -0.1, 0.26, math.nan)),
+        ("free_thresh=", lambda x: Thresholds(*x), ((0.7, 0.6), (-0.1, 0.5), (0.1, 1.1), (math.nan, 0.5))),
+    ],
+)
+def test_invalid_priors_and_thresholds_are_refused(name, make, values):
+    for value in values:
+        with pytest.raises(InvalidArgumentError, match=name):
+            make(value)
 
 
 @pytest.mark.parametrize("theta", [0.0, 1e-12, 0.1, 0.5, 0.77, 1.0])
@@ -117,12 +125,6 @@ def test_without_a_dead_band_only_a_half_is_unknown():
     assert classify(theta, 0.25).dtype == torch.int8
 
 
-@pytest.mark.parametrize("threshold", [0, -0.1, 0.26, float("nan")])
-def test_invalid_variance_thresholds_are_refused(threshold):
-    with pytest.raises(InvalidArgumentError, match="variance_threshold"):
-        classify(torch.tensor([0.5]), threshold)
-
-
 # -- counting ------------------------------------------------------------------------------------------
 
 
@@ -154,12 +156,6 @@ def test_lookup_reads_the_cell_and_is_half_outside():
 def test_thresholds_classify_free_unknown_and_occupied():
     theta = torch.tensor([0.0, 0.196, 0.5, 0.65, 0.651, 1.0], dtype=torch.float64)
     assert Thresholds().classify(theta).tolist() == [0, -1, -1, -1, 1, 1]
-
-
-@pytest.mark.parametrize(("free", "occupied"), [(0.7, 0.6), (-0.1, 0.5), (0.1, 1.1), (math.nan, 0.5)])
-def test_thresholds_reject_invalid_values(free, occupied):
-    with pytest.raises(InvalidArgumentError, match="free_thresh="):
-        Thresholds(free, occupied)
 
 
 # -- VoxelGrid: indices, centres, covering a box, and bad input ------------------------------------------
