@@ -185,13 +185,10 @@ def test_the_map_has_the_options_of_its_group(name, more, expected):
     assert (how.n_samples, how.prior, how.random_state) == (1000, 0.5, 7)
 
 
-def test_an_exploration_of_the_options_is_the_default_one(tmp_path):
+def test_explorations_fits_and_protocols_of_the_options_are_the_default_ones(tmp_path):
     trial = from_options.trial_of(composed("explore"), tmp_path)
     assert trial.team == TeamOptions()
     assert trial.world == WorldOptions(size=(50.0, 40.0, 8.0))
-
-
-def test_a_fit_of_the_options_is_the_default_one():
     from gmmtorch.experiments.evaluation.protocol_options import FitOptions, Protocol
 
     assert fit_options(composed("fit")) == FitOptions()

@@ -286,14 +286,16 @@ def calls(log: list[tuple[str, int, Any]], name: str) -> list[tuple[int, Any]]:
 
 @every_coordination
 @seeds
-def test_all_robots_take_snapshots_before_planning_and_send_views_after(name: str, seed: int) -> None:
-    _, log, plans = taken(name, seed)
+def test_all_robots_take_snapshots_before_planning_follow_their_last_proposal_and_send_views(name, seed):
+    agents, log, plans = taken(name, seed)
     assert log[:N] == [("begin_planning", robot, (NOW,)) for robot in range(N)]
     assert log[-N:] == [("send_views", robot, (NOW,)) for robot in range(N)]
     assert calls(log, "follow") == [(robot, ()) for robot in plans]
     last = max(row for row, (what, *_) in enumerate(log) if what == "propose")
     assert min(row for row, (what, *_) in enumerate(log) if what == "follow") > last
     assert len(log) == 4 * N + 2 * len(calls(log, "propose"))
+    for robot, plan in plans.items():
+        assert plan.path[0, 0] == 100 * robot + len(agents[robot].peers)
 
 
 @every_coordination
@@ -313,14 +315,6 @@ def test_a_plan_is_sent_once_and_before_later_robots_listen(name: str, seed: int
             assert robot not in fixed
             assert about == (pytest.approx(NOW + len(fixed) * OPTIONS.plan_slack),)
     assert OPTIONS.plan_slack > 2 * OPTIONS.latency
-
-
-@every_coordination
-@seeds
-def test_each_robot_follows_its_last_proposal(name: str, seed: int) -> None:
-    agents, _, plans = taken(name, seed)
-    for robot, plan in plans.items():
-        assert plan.path[0, 0] == 100 * robot + len(agents[robot].peers)
 
 
 @every_coordination

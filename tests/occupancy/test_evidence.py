@@ -65,12 +65,9 @@ def test_occupancy_probability_equals_equation_3_9(hits, misses, prior):
 
 @pytest.mark.parametrize("prior", [0, 1e-300, 0.1, 1 / 3, 1, 7.7])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_occupancy_without_evidence_is_exactly_half(prior, dtype):
+def test_occupancy_is_exactly_half_without_evidence_and_the_share_of_hits_without_a_prior(prior, dtype):
     zero = torch.zeros(3, dtype=dtype)
     assert occupancy_probability(zero, zero, prior).tolist() == [0.5] * 3
-
-
-def test_occupancy_with_prior_zero_is_the_share_of_hits():
     theta = occupancy_probability(torch.tensor([3.0, 0.0, 2.0]), torch.tensor([1.0, 5.0, 0.0]), 0)
     assert theta.tolist() == [0.75, 0.0, 1.0]
 
