@@ -13,10 +13,8 @@ from mixture.fit_contract import blobs
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.mixture import GaussianMixture, merge, simplify
-from gmmtorch.mixture.density import NotFittedError
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.reduction import COSTS, Gaussians, merge_components, merge_pairs
+from gmmtorch.mixture import GaussianMixture, NotFittedError, Parameters, merge, merge_components, simplify
+from gmmtorch.mixture.reduction import COSTS, Gaussians, merge_pairs
 
 dims = pytest.mark.parametrize("dim", [1, 2, 3, 5])
 costs = pytest.mark.parametrize("cost", list(COSTS))
