@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from gmmtorch.export import bag
-from gmmtorch.export.bag import cloud_fields, odometry_fields
+from gmmtorch.export import bag, cloud_fields, odometry_fields
 from gmmtorch.scan import ArrayLike
+
+
+def moved(x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:
+    """A pose (4, 4) that is turned about z only."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
 
 
 class BagWriter(bag.BagWriter):

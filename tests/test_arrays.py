@@ -11,11 +11,10 @@ import pytest
 import torch
 
 import gmmtorch as gt
-from gmmtorch import baselines, simulation
+from gmmtorch import GmmTorchError, baselines, register, simulation
 from gmmtorch.arrays import as_tensor
 from gmmtorch.datasets import Ranges
-from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.localization.registration import register
+from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.surfaces import clearance, expected_returns
 from gmmtorch.mixture import DepthCameraModel, LaserModel, Parameters, merge, prune, score_stream, simplify
 from gmmtorch.occupancy import (

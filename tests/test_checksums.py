@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from gmmtorch import baselines, mixture
+from gmmtorch import GaussianMap, Scan, baselines, mixture
 from gmmtorch.errors import DataError
-from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.streaming import State, read_state, write_state
-from gmmtorch.scan import Scan
 
 N_FLIPS = 200
 Written = tuple[Path, Callable[[Path], object]]

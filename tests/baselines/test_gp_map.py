@@ -50,8 +50,7 @@ def sklearn_process(length: float, variance: float, noise: float) -> GaussianPro
 @pytest.mark.parametrize(
     ("length", "variance", "noise"), [(1.0, 1.0, 0.01), (0.2, 2.5, 0.1), (5.0, 0.3, 0.01)]
 )
-def test_gp_regression_with_padding_equals_scikit_learn(dim, length, variance, noise):
-    generator = torch.Generator().manual_seed(0)
+def test_gp_regression_with_padding_equals_scikit_learn(dim, length, variance, noise, generator):
     sizes = [1, 7, 40]
     positions = torch.randn(3, 40, dim, generator=generator, dtype=torch.float64)
     values = torch.randn(3, 40, generator=generator, dtype=torch.float64)

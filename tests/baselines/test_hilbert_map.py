@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal, kl_divergence
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
+from gmmtorch.experiments.baselines import BayesianHilbertMap, HilbertMap
 from gmmtorch.experiments.baselines.bgk_map import sparse_kernel
 from gmmtorch.experiments.baselines.hilbert_features import (
     LatticeDesign,
@@ -27,9 +28,7 @@ from gmmtorch.experiments.baselines.hilbert_features import (
     nystroem_features,
 )
 from gmmtorch.experiments.baselines.hilbert_map import (
-    BayesianHilbertMap,
     Features,
-    HilbertMap,
     Posterior,
     fit_posterior,
     jaakkola_lambda,
@@ -264,8 +263,10 @@ def test_small_batches_reach_the_optimum_in_few_epochs():
 # -- the map ---------------------------------------------------------------------------------------------
 
 
-def test_hilbert_map_rejects_a_lattice_with_gaps():
-    made = HilbertMap(length=0.1, spacing=0.5)
+@pytest.mark.parametrize(
+    "made", [HilbertMap(length=0.1, spacing=0.5), BayesianHilbertMap(100.0, spacing=1.0)]
+)
+def test_lattices_and_hinges_with_gaps_are_rejected(made):
     with pytest.raises(InvalidArgumentError, match="gaps"):
         made.insert(wall_scan(2))
 
@@ -373,12 +374,11 @@ def test_variational_posterior_is_close_to_quadrature(n_features, n):
     assert float((moderated(*moments(design, posterior)) - theta).abs().max()) < 0.05
 
 
-def test_evidence_bound_is_highest_at_its_posterior():
+def test_evidence_bound_is_highest_at_its_posterior(generator):
     design, is_hit = problem(100, 4)
     prior = prior_of(4, full=True)
     best = fit_posterior(design, is_hit, prior, "full", 300)
     bound = evidence_bound(design, is_hit, prior, best)
-    generator = torch.Generator().manual_seed(0)
     for _ in range(20):
         mean = best.mean + 0.05 * torch.randn(4, generator=generator, dtype=torch.float64)
         assert evidence_bound(design, is_hit, prior, replace(best, mean=mean)) < bound
@@ -431,10 +431,9 @@ def full_map(**options: float) -> BayesianHilbertMap:
     )
 
 
-def test_the_posterior_of_each_scan_is_the_prior_of_the_next():
+def test_the_posterior_of_each_scan_is_the_prior_of_the_next(generator):
     made = full_map()
     scans = [wall_scan(2), wall_scan(2, 1, (1.3, -0.7, 0.3)), open_scan(2)]
-    generator = torch.Generator().manual_seed(0)
     previous = Posterior(torch.empty(0).double(), torch.empty(0, 0).double())
     earlier = torch.empty(0, 2).double()
     for scan in scans:
@@ -481,11 +480,6 @@ def test_full_covariance_rejects_too_many_hinges(monkeypatch):
     monkeypatch.setattr("gmmtorch.experiments.baselines.hilbert_map._MAX_FULL", 10)
     with pytest.raises(MemoryLimitError, match="mean_field"):
         full_map().insert(wall_scan(2))
-
-
-def test_bayesian_hilbert_map_rejects_hinges_with_gaps():
-    with pytest.raises(InvalidArgumentError, match="gaps"):
-        BayesianHilbertMap(100.0, spacing=1.0).insert(wall_scan(2))
 
 
 def test_damaged_files_of_a_full_covariance_are_refused(tmp_path):

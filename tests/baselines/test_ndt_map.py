@@ -80,8 +80,7 @@ def test_a_cell_stores_the_moments_of_its_returns(dim, tmp_path):
     np.testing.assert_allclose(covariance, np.cov(points.T), rtol=1e-4, atol=1e-6)
 
 
-def test_older_returns_lose_weight_above_max_points(tmp_path):
-    generator = torch.Generator().manual_seed(0)
+def test_older_returns_lose_weight_above_max_points(tmp_path, generator):
     old = torch.rand(1000, 2, generator=generator).double() * 0.2
     new = 0.7 + torch.rand(100, 2, generator=generator).double() * 0.2
     means = []

@@ -10,9 +10,7 @@ import torch
 from baselines.tensor_file_contract import TensorFileContract
 from occupancy.protocol_contract import RESOLUTION, lattice, open_scan, wall_scan
 
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.occupancy_grid import LogOdds, OccupancyGrid
+from gmmtorch.occupancy import Evidence, LogOdds, OccupancyGrid, VoxelGrid
 
 
 class GridContract(TensorFileContract):

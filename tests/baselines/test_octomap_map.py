@@ -12,10 +12,9 @@ import pytest
 import torch
 from occupancy.protocol_contract import RESOLUTION, OccupancyMapContract, lattice, open_scan, wall_scan
 
+from gmmtorch import OccupancyGrid, Scan
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.baselines.octomap_map import OctoMapMap, parsed_octree
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
-from gmmtorch.scan import Scan
 
 pyoctomap = pytest.importorskip("pyoctomap")
 

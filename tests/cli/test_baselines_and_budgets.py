@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 
-from gmmtorch import datasets
+from gmmtorch import GaussianMap, OccupancyGrid, datasets
 from gmmtorch.experiments.baselines.bgk_map import BGKMap, BGKPointsMap
 from gmmtorch.experiments.baselines.gp_map import GPMap
 from gmmtorch.experiments.baselines.hilbert_map import BayesianHilbertMap, HilbertMap
 from gmmtorch.experiments.baselines.ndt_map import NDTMap
 from gmmtorch.experiments.baselines.octomap_map import OctoMapMap
-from gmmtorch.experiments.evaluation import methods
-from gmmtorch.experiments.evaluation.queries import FREE, OCCUPIED
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
+from gmmtorch.experiments.evaluation import FREE, OCCUPIED, methods
 
 Run = Callable[..., Finished]
 BASELINES = {

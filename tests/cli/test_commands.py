@@ -26,11 +26,9 @@ from command_runs import (
 )
 
 import gmmtorch
+from gmmtorch import GaussianMap, GaussianMixture, OccupancyGrid
 from gmmtorch.experiments.studies import ComponentCountStudy, InitializationStudy, SensorModelStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.estimators.sensor_model import LaserModel
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
+from gmmtorch.mixture import LaserModel
 
 Run = Callable[..., Finished]
 OCCUPANCY_FIELDS = {

@@ -17,17 +17,14 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
 
-from gmmtorch import datasets
-from gmmtorch.cli import build, common, export, inputs, localize, options_help
-from gmmtorch.cli.inputs import open_dataset
+from gmmtorch import GaussianMap, IncrementalRule, NoveltyRule, WindowedRule, datasets
+from gmmtorch.cli import build, common, export, inputs, localize, open_dataset, options_help
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 from gmmtorch.experiments.cli import studies as study_cases
 from gmmtorch.experiments.cli.experiment_schema import STUDIES
 from gmmtorch.experiments.cli.fit_runs import fit_options
 from gmmtorch.experiments.evaluation import methods
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.team.cli import from_options
 from gmmtorch.team.exploration.mission.options import FRAMEWORKS, THESIS, TeamOptions
 from gmmtorch.team.exploration.mission.trials import WorldOptions
@@ -188,13 +185,10 @@ def test_the_map_has_the_options_of_its_group(name, more, expected):
     assert (how.n_samples, how.prior, how.random_state) == (1000, 0.5, 7)
 
 
-def test_an_exploration_of_the_options_is_the_default_one(tmp_path):
+def test_explorations_fits_and_protocols_of_the_options_are_the_default_ones(tmp_path):
     trial = from_options.trial_of(composed("explore"), tmp_path)
     assert trial.team == TeamOptions()
     assert trial.world == WorldOptions(size=(50.0, 40.0, 8.0))
-
-
-def test_a_fit_of_the_options_is_the_default_one():
     from gmmtorch.experiments.evaluation.protocol_options import FitOptions, Protocol
 
     assert fit_options(composed("fit")) == FitOptions()

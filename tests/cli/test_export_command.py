@@ -13,14 +13,11 @@ import torch
 from command_runs import Finished, as_it_was, refused, run_here, succeeded
 from export.map_examples import read_map_image
 
+from gmmtorch import GaussianMap, GaussianMixture, OccupancyGrid, Scan
 from gmmtorch.cli.reporting import exported_files
 from gmmtorch.datasets import load
-from gmmtorch.export.mixture_formats import read_gira_csv, read_npz
-from gmmtorch.export.trajectory_files import write_tum
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture import GaussianMixture
-from gmmtorch.occupancy.occupancy_grid import LogOdds, OccupancyGrid
-from gmmtorch.scan import Scan
+from gmmtorch.export import read_gira_csv, read_npz, write_tum
+from gmmtorch.occupancy.occupancy_grid import LogOdds
 
 Run = Callable[..., Finished]
 

@@ -11,8 +11,7 @@ import torch
 from command_runs import QUIET, Finished, refused, run_here, succeeded
 from sensor_bags import BagWriter
 
-from gmmtorch.datasets import Dataset, load
-from gmmtorch.datasets.trajectory import read_trajectory
+from gmmtorch.datasets import Dataset, load, read_trajectory
 from gmmtorch.export.trajectory_files import write_tum
 from gmmtorch.mapping.gaussian_map import GaussianMap
 

@@ -15,9 +15,7 @@ from command_runs import QUIET, Disk, Finished, refused, run_here, succeeded
 from mapping.map_cases import assert_same_components
 
 from gmmtorch.datasets import load
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.map_builder import MapBuilder
-from gmmtorch.mapping.tiles.tiled_map import TiledMap
+from gmmtorch.mapping import GaussianMap, MapBuilder, TiledMap
 from gmmtorch.report import Board
 
 Run = Callable[..., Finished]

@@ -19,9 +19,7 @@ from gmmtorch.cli.recordings import find_recordings, run_tasks
 from gmmtorch.cli.reporting import map_outputs
 from gmmtorch.datasets import load
 from gmmtorch.errors import MissingDataError
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles.tiled_map import TiledMap
+from gmmtorch.mapping import Components, GaussianMap, TiledMap
 from gmmtorch.occupancy.calibrator import Calibration
 
 Run = Callable[..., Finished]

@@ -14,16 +14,10 @@ import torch
 from torch import Tensor
 
 from gmmtorch.datasets import load
-from gmmtorch.live import viewer_scene
-from gmmtorch.live.publishers import MapPublisher
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles.tile_files import tile_files
-from gmmtorch.mapping.tiles.tiled_map import TiledMap
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.evidence import Thresholds
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.report import map_images
-from gmmtorch.report.map_images import MapPanel
+from gmmtorch.live import MapPublisher, viewer_scene
+from gmmtorch.mapping import GaussianMap, TiledMap, tile_files
+from gmmtorch.occupancy import Calibration, Thresholds, VoxelGrid
+from gmmtorch.report import MapPanel, map_images
 
 SIDE = 0.25
 UNUSUAL = Calibration.of_bytes(np.array([1, 8, 1, 0, 0, -1, 0, 0, -0.5, 0, 0, 0.5, 0, 0], "<f2").tobytes())

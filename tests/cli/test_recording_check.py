@@ -12,7 +12,7 @@ from command_runs import QUIET, Finished, run_here
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 from gmmtorch.cli.reporting import recording_check
 from gmmtorch.errors import DataError
@@ -22,12 +22,6 @@ Run = Callable[..., Finished]
 RING = np.stack(
     [4 * np.cos(np.arange(0, 6.2, 0.1)), 3 * np.sin(np.arange(0, 6.2, 0.1)), np.arange(62) / 60], 1
 )
-
-
-def moved(x: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[0, 3] = x
-    return pose
 
 
 @pytest.fixture

@@ -25,19 +25,13 @@ from exploration.replays import content
 from mapping.random_components import random_components
 from sensor_bags import BagWriter
 
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import Topic
+from gmmtorch.datasets import Ranges, Sensor, Topic, TransformTree
 from gmmtorch.datasets.ros.bag_topics import LASER as LASERS
-from gmmtorch.datasets.ros.bag_topics import Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
 from gmmtorch.live.live_scans import LiveOptions, LiveScans
 from gmmtorch.live.ros import Node
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.mapping import GaussianMap, MapBuilder
 from gmmtorch.team.cli import from_options
-from gmmtorch.team.sharing import Replica
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.transport.udp import UdpTransport
+from gmmtorch.team.sharing import Replica, SharedMap, UdpTransport
 
 LASER = "sensor_msgs/msg/LaserScan"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"

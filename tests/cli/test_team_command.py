@@ -20,9 +20,7 @@ from sharing.replica_histories import everything
 from gmmtorch.team.cli import team
 from gmmtorch.team.cli.from_options import facts_of
 from gmmtorch.team.cli.team import RobotProcess
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.security import KEY_VARIABLE
+from gmmtorch.team.sharing import KEY_VARIABLE, Replica, Store
 
 Run = Callable[..., Finished]
 

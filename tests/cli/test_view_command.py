@@ -8,8 +8,7 @@ from command_runs import composed, refused, run_here, succeeded
 from gmmtorch.cli import inputs
 from gmmtorch.cli.view import overrides
 from gmmtorch.datasets import load
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles.tile_files import tile_files
+from gmmtorch.mapping import GaussianMap, tile_files
 
 pytest.importorskip("viser")
 

@@ -25,9 +25,7 @@ import test_point_chunks
 import torch
 from PIL import Image
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.point_files.mesh_files import read_triangles
-from gmmtorch.datasets.point_files.point_chunks import open_points
+from gmmtorch.datasets import load, open_points, read_triangles
 from gmmtorch.errors import GmmTorchError
 
 MEMORY_BYTES = 1 << 30

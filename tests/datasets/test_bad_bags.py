@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_rosbag import POINTS, clouds, drive, moved
+from test_rosbag import POINTS, clouds, drive
 
 from gmmtorch.datasets import BagReader, load
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 FORMATS = pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
 

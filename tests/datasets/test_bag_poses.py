@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sensor_bags import BagWriter
-from test_rosbag import POINTS, moved
+from sensor_bags import BagWriter, moved
+from test_rosbag import POINTS
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch.datasets import TransformTree, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 
 Sample = tuple[int, np.ndarray, np.ndarray]

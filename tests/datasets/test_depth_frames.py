@@ -56,12 +56,14 @@ def test_depth_frames_are_turned_so_that_up_is_z(tmp_path, up):
         load("depth_frames", folder, up="w")
 
 
-def test_depth_frames_scale_their_units(tmp_path):
+def test_depth_frames_scale_their_units_and_may_have_no_valid_pixel(tmp_path):
     folder = depth_folder(tmp_path, [(np.full((4, 6), 5000, dtype=np.uint16), np.eye(4))])
     assert load("depth_frames", folder).image(0)[0].unique().tolist() == [5.0]
     assert load("depth_frames", folder, depth_scale=0.0002).image(0)[0].unique().tolist() == [1.0]
     with pytest.raises(InvalidArgumentError, match="depth_scale=0"):
         load("depth_frames", folder, depth_scale=0)
+    Image.fromarray(np.zeros((4, 6), np.uint16)).save(folder / "frame-000000.depth.png")
+    assert load("depth_frames", folder)[0].n_beams == 0
 
 
 @pytest.mark.parametrize("factor", [0.5, 2])
@@ -82,11 +84,6 @@ def test_depth_frames_refuse_transposed_intrinsics(tmp_path):
         DataError, match=r"camera-intrinsics\.txt: .*last row must be 0 0 1\. It looks transp"
     ):
         load("depth_frames", folder)
-
-
-def test_depth_frames_read_an_image_without_valid_pixels(tmp_path):
-    folder = depth_folder(tmp_path, [(np.zeros((4, 6), dtype=np.uint16), np.eye(4))])
-    assert load("depth_frames", folder)[0].n_beams == 0
 
 
 def saved(write: Callable[..., object], content: object) -> bytes:

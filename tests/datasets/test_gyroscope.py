@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from gmmtorch.datasets import load
 from gmmtorch.datasets.ros.rosbag import Gyroscope
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization import with_odometry
-from gmmtorch.localization.odometry import Odometry
+from gmmtorch.localization import Odometry, with_odometry
 
 pytest.importorskip("rosbags")
 

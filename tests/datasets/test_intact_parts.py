@@ -11,15 +11,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_rosbag import moved
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.ros.bag_reader import BagReader
+from gmmtorch.datasets import BagReader, load
 from gmmtorch.errors import DataError
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 FORMATS = pytest.mark.parametrize("kind", ["chunks", "mcap", "db3", "bag"])
 PERIOD, N_CLOUDS = 0.02, 100

@@ -9,17 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from packet_files import (
-    PIXELS,
-    SHAPES,
-    frames,
-    hesai_packet,
-    ouster_metadata,
-    ouster_packet,
-    write_capture,
-)
+from packet_files import PIXELS, SHAPES, frames, hesai_packet, ouster_metadata, ouster_packet, write_capture
 from test_more_sensors import packet as velodyne_packet
-from test_rosbag import drive, moved
+from test_rosbag import drive
 
 from gmmtorch.datasets import BagReader, bag_facts, load
 from gmmtorch.datasets.packets import hesai, ouster
@@ -28,7 +20,7 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 RNG = np.random.default_rng(5)
 TABLED = ("Pandar40P", "Pandar64", "PandarQT64", "XT16", "XT32", "XT32M2X")

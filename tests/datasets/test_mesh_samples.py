@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.point_files.mesh_files import read_triangles
+from gmmtorch.datasets import load, read_triangles
 from gmmtorch.datasets.synthetic import sample_surface
 from gmmtorch.errors import DataError, InvalidArgumentError
 

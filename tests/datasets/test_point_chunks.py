@@ -12,14 +12,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets.point_files.point_chunks import (
-    PointChunks,
-    in_memory,
-    merge_surveys,
-    open_points,
-    row_uniform,
-    survey,
-)
+from gmmtorch.datasets import PointChunks, in_memory, merge_surveys, open_points, survey
+from gmmtorch.datasets.point_files.point_chunks import row_uniform
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError
 
 N = 23

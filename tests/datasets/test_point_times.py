@@ -15,14 +15,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import Dataset
+from gmmtorch.datasets import Dataset, Rate, load
+from gmmtorch.datasets.ros.point_times import PointTimes
 
 pytest.importorskip("rosbags")
 
 from sensor_bags import BagWriter
-
-from gmmtorch.datasets.ros.point_times import PointTimes, Rate
 
 WALLS = np.array([6.0, 4.0, 1.25])  # half of the room
 SWEEP = 0.1  # s

@@ -53,14 +53,9 @@ def test_carmen_separates_no_return_and_invalid_readings(tmp_path):
     assert load("carmen", path, no_return_range=0)[0].no_return.shape == (0, 2)
     unlimited = load("carmen", path, max_range=math.inf)[0]
     assert unlimited.points.norm(dim=1).tolist() == pytest.approx([1.0, 81.83, 50.0])
-
-
-def test_carmen_reads_a_scan_without_returns(tmp_path):
-    path = tmp_path / "a.log"
     path.write_text(flaser([81.83] * 180))
     scan = load("carmen", path)[0]
-    assert scan.points.shape == (0, 2)
-    assert scan.no_return.shape == (180, 2)
+    assert (scan.points.shape, scan.no_return.shape) == ((0, 2), (180, 2))
     assert load("carmen", path, no_return_range=0)[0].n_beams == 0
 
 
@@ -169,9 +164,11 @@ def test_scan_folder_rejects_invalid_poses(tmp_path, poses, message):
         load("scan_folder", scan_folder(tmp_path, {"0.pcd": pcd([])}, poses))
 
 
-def test_scan_folder_reports_missing_files(tmp_path):
+def test_folders_without_files_are_reported(tmp_path):
     with pytest.raises(DataError, match=r"scans.*contains no \.pcd"):
         load("scan_folder", tmp_path)
+    with pytest.raises(DataError, match=r"contains no \.pcd file"):
+        load("pcd_viewpoint", tmp_path)
     scan_folder(tmp_path, {"0.pcd": pcd([])}, IDENTITY)
     (tmp_path / "poses.txt").unlink()
     with pytest.raises(DataError, match=r"poses\.txt is missing"):
@@ -198,8 +195,3 @@ def test_pcd_viewpoint_rejects_a_viewpoint_without_position(tmp_path, viewpoint)
     (tmp_path / "0.pcd").write_bytes(pcd([(1.0, 2.0, 3.0)], viewpoint))
     with pytest.raises(DataError, match=r"0\.pcd: VIEWPOINT"):
         load("pcd_viewpoint", tmp_path)[0]
-
-
-def test_pcd_viewpoint_rejects_an_empty_folder(tmp_path):
-    with pytest.raises(DataError, match=r"contains no \.pcd file"):
-        load("pcd_viewpoint", tmp_path)

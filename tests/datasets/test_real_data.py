@@ -12,15 +12,13 @@ import torch
 from scipy.spatial import cKDTree
 from sensor_bags import BagWriter
 
+from gmmtorch import GaussianMap, Scan
 from gmmtorch.datasets import Dataset, load
 from gmmtorch.datasets.depth_images import back_project
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.scan_logs import beam_angles
 from gmmtorch.errors import DataError
-from gmmtorch.export.bag import write_bag
-from gmmtorch.export.trajectory_files import write_kitti
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.scan import Scan
+from gmmtorch.export import write_bag, write_kitti
 
 pytestmark = pytest.mark.real_data
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import scan_files
 from test_depth_cameras import OWN, camera, recorded
-from test_rosbag import POINTS, drive, moved
+from test_rosbag import POINTS, drive
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import GmmTorchError, text_of
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 from gmmtorch.export.bag import cloud_fields
 

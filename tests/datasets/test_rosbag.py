@@ -17,7 +17,7 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]])
 LIVOX = """std_msgs/Header header
@@ -37,11 +37,6 @@ uint8 tag
 uint8 line
 """
 FORMATS = pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
-
-
-def moved(x: float, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
 
 
 def drive(bag: BagWriter, times: tuple[float, ...] = (0.0, 1.0, 2.0), speed: float = 1.0) -> None:

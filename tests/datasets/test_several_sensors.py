@@ -11,20 +11,14 @@ import torch
 from gmmtorch import GaussianMap
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.localization import Tracker, with_odometry
-from gmmtorch.localization.tracker import locate_scans
+from gmmtorch.localization import Tracker, locate_scans, with_odometry
 from gmmtorch.mapping import MapBuilder
 
 pytest.importorskip("rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
 FRONT_REAR = ["/front", "/rear"]
-
-
-def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> np.ndarray:
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    return np.array([[cos, -sin, 0, x], [sin, cos, 0, y], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 
 
 def ring(radius: float) -> np.ndarray:
@@ -36,11 +30,11 @@ def ring(radius: float) -> np.ndarray:
 def two_lidars(path: Path, root_of_rear: str = "base", laser: bool = False) -> Path:
     """A drive of 2 s with a lidar ahead, and another one, or a laser, at the back, that looks backwards."""
     with BagWriter(path) as bag:
-        mounts = {("base", "front"): pose(1.0), (root_of_rear, "rear"): pose(-1.0, 0.2, np.pi)}
+        mounts = {("base", "front"): moved(1.0), (root_of_rear, "rear"): moved(-1.0, 0.2, yaw=np.pi)}
         bag.transforms(0.0, mounts, static=True)
         for i in range(21):
-            bag.transforms(i * 0.1, {("odom", "base"): pose(i * 0.1, 0.0, i * 0.05)})
-            bag.odometry("/odom", i * 0.1, "odom", "base", pose(i * 0.1, 0.0, i * 0.05))
+            bag.transforms(i * 0.1, {("odom", "base"): moved(i * 0.1, yaw=i * 0.05)})
+            bag.odometry("/odom", i * 0.1, "odom", "base", moved(i * 0.1, yaw=i * 0.05))
             stamped = {"header": {"frame_id": "odom"}, "pose": {"orientation": {"w": 1.0}}}
             bag.message("/pose", "geometry_msgs/msg/PoseStamped", i * 0.1, stamped)
         for i in range(20):
@@ -70,7 +64,7 @@ def test_scans_of_two_lidars_come_in_the_order_of_their_times(tmp_path, suffix, 
         assert torch.equal(both[i].points, scan.points)
         assert torch.equal(both.pose(i), known)
     rear = int((both.times - both.times[0] - 0.04).abs().argmin())  # 0.06 s after the start of the drive
-    turned = pose(0.06, 0.0, 0.03) @ pose(-1.0, 0.2, np.pi)
+    turned = moved(0.06, yaw=0.03) @ moved(-1.0, 0.2, yaw=np.pi)
     np.testing.assert_allclose(both.pose(rear), turned, atol=1e-3)
 
 
@@ -134,9 +128,9 @@ def test_a_depth_camera_beside_a_lidar(tmp_path):
     path = tmp_path / "a.mcap"
     optical = np.array([[0, 0, 1, 0.5], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1.0]])
     with BagWriter(path) as bag:
-        bag.transforms(0.0, {("base", "lidar"): pose(0.0), ("base", "camera"): optical}, static=True)
+        bag.transforms(0.0, {("base", "lidar"): moved(0.0), ("base", "camera"): optical}, static=True)
         for i in range(8):
-            bag.transforms(i * 0.1, {("odom", "base"): pose(i * 0.1)})
+            bag.transforms(i * 0.1, {("odom", "base"): moved(i * 0.1)})
         for i in range(6):
             bag.cloud("/lidar", i * 0.1, "lidar", ring(4.0))
             camera = np.array([[8.0, 0, 8], [0, 8.0, 6], [0, 0, 1]])

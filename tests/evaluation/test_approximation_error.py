@@ -11,16 +11,15 @@ import torch
 from pillar_room import timeless
 
 from gmmtorch.experiments.report.approximation_error_figures import approximation_figures
+from gmmtorch.experiments.studies import ApproximationErrorStudy, run_approximation_error
 from gmmtorch.experiments.studies.approximation_error import (
     Scene,
     cast_rays,
     map_rows,
     methods,
     random_scene,
-    run_approximation_error,
     sweep_rows,
 )
-from gmmtorch.experiments.studies.study_options import ApproximationErrorStudy
 
 SMALL = ApproximationErrorStudy(
     dims=(2,),

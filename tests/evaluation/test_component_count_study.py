@@ -10,16 +10,13 @@ import torch
 from evaluation.pillar_room import room_scans
 from sklearn.cluster import MeanShift
 
+from gmmtorch import GaussianMap, GaussianMixture, Scan
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.fits import FitData, Row, split
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.experiments.studies import fit_studies
-from gmmtorch.experiments.studies.fit_studies import count_modes, middle, run_component_count
-from gmmtorch.experiments.studies.study_options import ComponentCountStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture import GaussianMixture
-from gmmtorch.scan import Scan
+from gmmtorch.experiments.studies import ComponentCountStudy, fit_studies, middle, run_component_count
+from gmmtorch.experiments.studies.fit_studies import count_modes
 
 STUDY = ComponentCountStudy(
     n_components=(2, 6, 12, 24),

@@ -19,9 +19,7 @@ from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.fits import ESTIMATORS, FitOutcome, Views, compare, means, split
 from gmmtorch.experiments.evaluation.metrics import psnr2
 from gmmtorch.experiments.evaluation.protocol_options import FitOptions
-from gmmtorch.mixture.estimators.sensor_model import measured_sensor
-from gmmtorch.mixture.prune_options import PruneOptions
-from gmmtorch.mixture.pruning import prune
+from gmmtorch.mixture import PruneOptions, measured_sensor, prune
 from gmmtorch.report import ignore
 
 SMALL = FitOptions(n_components=6, max_iter=60)
@@ -162,7 +160,7 @@ def test_rows_depend_only_on_the_seed(everything):
 
 
 @pytest.mark.parametrize("method", ESTIMATORS)
-def test_lower_bounds_increase_with_one_per_iteration(method, everything):
+def test_lower_bounds_increase_and_progress_goes_from_zero_to_the_total(method, everything):
     bounds = everything.outcome.mixtures[method].lower_bounds_
     (row,) = (row for row in everything.outcome.rows if row["method"] == method)
     assert len(bounds) == row["n_iterations"] > 1
@@ -171,10 +169,6 @@ def test_lower_bounds_increase_with_one_per_iteration(method, everything):
         assert bounds[-1] > bounds[0]
     else:
         assert all(b >= a - 1e-5 for a, b in itertools.pairwise(bounds))
-
-
-@pytest.mark.parametrize("method", ESTIMATORS)
-def test_progress_goes_from_zero_to_the_total(method, everything):
     events = [(done, total) for stage, done, total in everything.events if stage == method]
     assert events[0][0] == 0
     assert events[-1][0] == events[-1][1]

@@ -11,13 +11,10 @@ import pytest
 import torch
 from pillar_room import room_scans, timeless
 
+from gmmtorch import GaussianMap, OccupancyGrid, Scan
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.held_out import MapFactory, Outcome, choose, evaluate, methods
-from gmmtorch.experiments.evaluation.protocol_options import Protocol
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
-from gmmtorch.scan import Scan
+from gmmtorch.experiments.evaluation import MapFactory, Outcome, Protocol, choose, evaluate, methods
 
 CONTRACT: dict[str, type] = {
     "dataset": str,

@@ -8,19 +8,13 @@ import pytest
 import torch
 from pillar_room import room_scans
 
+from gmmtorch import GaussianMap, Scan, WindowedRule
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation.held_out import Form, MapFactory, Protocol, evaluate, methods
 from gmmtorch.experiments.evaluation.queries import perturb_poses, pose_perturbations
-from gmmtorch.experiments.studies.map_studies import (
-    build_by_scan,
-    correct_poses,
-    evaluate_correction,
-    run_auc_memory,
-)
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.scan import Scan
+from gmmtorch.experiments.studies import evaluate_correction, run_auc_memory
+from gmmtorch.experiments.studies.map_studies import build_by_scan, correct_poses
 
 PROTOCOL = Protocol(test_every=4, resolution=(0.2,))
 

@@ -16,18 +16,8 @@ from sklearn.metrics import brier_score_loss, log_loss, roc_auc_score
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.experiments.evaluation.metrics import (
-    SeenPredictions,
-    auc_gain,
-    auc_interval,
-    psnr2,
-    psnr_terms,
-    reliability,
-    roc,
-    scores,
-    unknown_scores,
-)
-from gmmtorch.experiments.evaluation.queries import hit_and_free
+from gmmtorch.experiments.evaluation import auc_gain, auc_interval, hit_and_free, reliability, roc
+from gmmtorch.experiments.evaluation.metrics import SeenPredictions, psnr2, psnr_terms, scores, unknown_scores
 from gmmtorch.occupancy.calibrator import N_BINS, Calibrator, reliability_of, scores_of
 from gmmtorch.scan import Scan
 
@@ -99,13 +89,10 @@ def test_interval_matches_resampling_of_single_points(levels):
     assert high - low == pytest.approx(expected[1] - expected[0], rel=0.12)
 
 
-def test_interval_depends_only_on_the_seed():
+def test_interval_depends_only_on_the_seed_and_that_of_equal_scores_is_a_point():
     occupied, free = probabilities(200, 0.7, 0), probabilities(200, 0.0, 1)
     assert interval(occupied, free, seed=1) == interval(occupied, free, seed=1)
     assert interval(occupied, free, seed=1) != interval(occupied, free, seed=2)
-
-
-def test_interval_of_equal_scores_is_a_point():
     half = torch.full((30,), 0.5)
     assert interval(half, half) == (0.5, 0.5, 0.5)
 
@@ -130,36 +117,21 @@ def test_auc_gain_matches_scikit_learn_and_a_bootstrap(levels):
         rows, columns = rng.integers(0, 400, 400), rng.integers(0, 600, 600)
         gains.append(area(occupied[rows], free[columns]) - area(before[0][rows], before[1][columns]))
     assert high - low == pytest.approx(2 * 1.96 * np.std(gains), rel=0.15)
-
-
-def test_auc_gain_of_equal_answers_is_exactly_zero():
-    same = probabilities(50, 0.8, 0), probabilities(60, -0.2, 1)
-    assert auc_gain(same, same) == (0.0, 0.0, 0.0)
+    assert auc_gain(before, before) == (0.0, 0.0, 0.0)
 
 
 # -- the other scores -----------------------------------------------------------------------------
 
 
-def test_unknown_scores_match_a_hand_count():
+def test_unknown_scores_match_a_hand_count_and_are_none_without_unknown_points():
     unknown, free = torch.tensor([0.5, 0.5, 0.125, 0.75]), torch.tensor([0.125, 0.25, 0.0625, 0.5])
     # |θ − ½|: unknown 0, 0, 3/8, 1/4; free 3/8, 1/4, 7/16, 0. Ordered pairs, ties count ½:
     right = (3 + 0.5) + (3 + 0.5) + (1 + 0.5) + (2 + 0.5)
-    assert unknown_scores(unknown, free) == {
-        "unknown_auc": pytest.approx(right / 16),
-        "unknown_called_free": 1 / 4,
-        "unknown_called_occupied": 1 / 4,
-        "free_recall": 2 / 4,
-    }
-
-
-def test_unknown_scores_are_none_without_unknown_points():
+    names = ("unknown_auc", "unknown_called_free", "unknown_called_occupied", "free_recall")
+    expected = (pytest.approx(right / 16), 1 / 4, 1 / 4, 2 / 4)
+    assert unknown_scores(unknown, free) == dict(zip(names, expected, strict=True))
     found = unknown_scores(torch.empty(0), torch.tensor([0.1, 0.9]))
-    assert found == {
-        "unknown_auc": None,
-        "unknown_called_free": None,
-        "unknown_called_occupied": None,
-        "free_recall": 0.5,
-    }
+    assert found == dict(zip(names, (None, None, None, 0.5), strict=True))
 
 
 # -- PSNR2 ----------------------------------------------------------------------------------------
@@ -191,12 +163,8 @@ def test_psnr_terms_separate_missing_from_extra_points(generator):
     assert forward == math.inf
     assert backward < 0
     assert psnr2(points, points[:20]) == math.inf
-
-
-def test_psnr2_of_a_single_point_is_infinite():
-    point = torch.tensor([[1.0, 2.0, 3.0]])
-    assert psnr2(point, point) == math.inf
-    assert psnr2(point, point + 1) == -math.inf
+    assert psnr2(points[:1], points[:1]) == math.inf
+    assert psnr2(points[:1], points[:1] + 1) == -math.inf
 
 
 def drawn(n: int = 5000, seed: int = 0, bend: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -242,11 +210,8 @@ def test_scores_match_scikit_learn():
     called = (theta > 0.5).double()
     called[theta == 0.5] = 0.5  # counts one half
     assert found["accuracy"] == pytest.approx(1 - float((called - labels).abs().mean()))
-
-
-def test_log_loss_is_one_bit_at_one_half_and_52_for_a_certain_mistake():
-    for theta, bits in (([0.5, 0.5], 1), ([0.0, 1.0], 0), ([1.0, 0.0], 52)):
-        found = scores(torch.tensor(theta), torch.tensor([0, 1]))
+    for certain, bits in (([0.5, 0.5], 1), ([0.0, 1.0], 0), ([1.0, 0.0], 52)):
+        found = scores(torch.tensor(certain), torch.tensor([0, 1]))
         assert found["log_loss_bits"] == pytest.approx(bits, abs=1e-12)
 
 

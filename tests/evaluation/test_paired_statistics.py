@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.mission.results import (
-    mean_band,
-    on_common_times,
-    paired_interval,
-    time_to_share,
-)
+from gmmtorch.team.exploration import mean_band, on_common_times, paired_interval, time_to_share
 
 
 @pytest.mark.parametrize("n", [2, 5, 30])

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from gmmtorch import GaussianMap, Scan
 from gmmtorch.datasets import load
 from gmmtorch.experiments.evaluation.held_out import Protocol, choose, evaluate, methods
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.scan import Scan
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 

@@ -12,14 +12,13 @@ from evaluation.pillar_room import room_scan
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
+from gmmtorch import GaussianMap, Scan
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import queries
 from gmmtorch.experiments.studies.sensor_noise import VARIANTS, run_sensor_noise
 from gmmtorch.experiments.studies.study_options import SensorModelStudy
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mixture.estimators.sensor_model import LaserModel
-from gmmtorch.scan import Scan
+from gmmtorch.mixture import LaserModel
 
 NOISE = 0.04
 SENSOR = LaserModel(noise=NOISE, divergence=1e-4)

@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 import torch
 
+from gmmtorch import GaussianMap, IncrementalRule, Scan
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.studies.study_options import COUNTS, VarianceThresholdStudy
 from gmmtorch.experiments.studies.variance_threshold import (
@@ -17,13 +18,7 @@ from gmmtorch.experiments.studies.variance_threshold import (
     run_variance_threshold,
     seen_past,
 )
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.evidence import probability
-from gmmtorch.occupancy.forms.point import PointEvidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
-from gmmtorch.scan import Scan
+from gmmtorch.occupancy import Calibration, PointEvidence, SparseEvidence, probability
 
 
 def test_decided_matches_a_hand_count():

@@ -24,12 +24,9 @@ from sharing.kill_store import die_after_steps
 
 from gmmtorch.files import write_json
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.team.exploration.mission.driver import WallClock, drive
-from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.exploration.mission.robot_view import ReplayingRobotView
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.udp import LOOPBACK, UdpTransport, unicast_socket
+from gmmtorch.team.exploration import ReplayingRobotView, ReplayMission, WallClock, drive
+from gmmtorch.team.sharing import Replica, Store, UdpTransport
+from gmmtorch.team.sharing.transport.udp import LOOPBACK, unicast_socket
 
 N_SCANS = 31
 KILLS_OF_A_ROBOT = 5

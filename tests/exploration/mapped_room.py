@@ -9,19 +9,14 @@ from typing import Any
 import pytest
 import torch
 
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.cells import Box
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.mapping import Components, NoveltyRule
+from gmmtorch.occupancy import Box, RollingWindow
 from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.options import THESIS, FrameRule, TeamOptions
 from gmmtorch.team.exploration.robot.mapper import GmmMapper, Memo
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
-from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing import Broadcast, ReceivedMessage, Replica, decode
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, CountsMessage
-from gmmtorch.team.sharing.messages.message_registry import decode
-from gmmtorch.team.sharing.radio import ReceivedMessage
-from gmmtorch.team.sharing.replica.replica import Replica
 
 CAMERA = DepthCamera(width=32, height=24, max_range=4.0)
 NOVELTY = NoveltyRule(resolution=0.2, observed=0.5)

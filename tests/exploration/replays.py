@@ -11,17 +11,12 @@ from typing import Any
 
 import torch
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import DatasetShard, shard_indices
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
+from gmmtorch.datasets import DatasetShard, load, shard_indices
+from gmmtorch.mapping import Components, GaussianMap, IncrementalRule, WindowedRule, quantized
 from gmmtorch.scan import Scan
 from gmmtorch.team.exploration.mission.driver import Drivable, Run, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
+from gmmtorch.team.sharing import Replica, Store
 
 RULES = {
     "per_scan": WindowedRule(window=1, max_origins=1),

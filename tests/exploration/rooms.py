@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.robot_camera import DepthCamera
-from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.world.world import World
+from gmmtorch.simulation import DepthCamera, box
+from gmmtorch.team.exploration import TeamOptions, World
+from gmmtorch.team.sharing import PlanMessage
 
 SMALL = TeamOptions(
     size=2,
@@ -45,3 +44,10 @@ def small_room() -> World:
 def without_seconds(row: dict[str, Any]) -> dict[str, Any]:
     kept = {k: v for k, v in row.items() if not k.endswith("seconds")}
     return json.loads(json.dumps(kept, allow_nan=False))
+
+
+def plan_ahead(n: int, step: float = 0.2, sender: int = 1) -> PlanMessage:
+    """A plan of n poses along x, one metre apart."""
+    path = torch.zeros(n, 4, dtype=torch.float64)
+    path[:, 0] = torch.arange(1, n + 1)
+    return PlanMessage(sender, 0, 0.0, step, path, torch.zeros(0, 4))

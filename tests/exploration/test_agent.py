@@ -18,13 +18,12 @@ from sharing.message_examples import examples, frame_of_components, views
 
 from gmmtorch.errors import DataError
 from gmmtorch.occupancy.voxels.cells import CellEvidence
-from gmmtorch.team.exploration.mission.driver import Stopwatch
-from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration import Agent, Stopwatch, TeamOptions
 from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
 from gmmtorch.team.exploration.planning.planner_interface import Plan, PlanningTask
 from gmmtorch.team.exploration.planning.primitives import Primitives
 from gmmtorch.team.exploration.planning.view_evaluator import ViewEvaluator
-from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingRule
+from gmmtorch.team.exploration.robot.agent import Robot, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.sharing.messages.component_messages import encode_components

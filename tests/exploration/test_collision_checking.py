@@ -125,25 +125,6 @@ def test_cells_in_sphere_lie_entirely_inside(seed, radius, far):
     assert not bool(found.observed.any())
 
 
-def test_obstacle_cells_are_never_free():
-    obstacles = torch.tensor([[-20, -20, -8], [0, 3, 2], [0, 3, 2], [-25, 0, 0], [24, 0, 0], [0, 0, 99]])
-    sphere = cells_in_sphere(torch.tensor([0.1, 0.7, 0.5]), 1.0, CELL)
-    found = known(torch.zeros(SHAPE, dtype=torch.bool), obstacles=obstacles, known_free=sphere)
-    assert (~found.free).nonzero().tolist() == [[4, 4, 4], [24, 27, 14]]
-    assert not bool(found.passable[24, 27, 14])
-    assert not bool(found.passable[23, 26, 12])
-
-
-def test_passable_cells_have_a_margin_of_half_a_cell():
-    blocked = torch.rand(SHAPE, generator=seeded(8)) < 0.002
-    passable = known(blocked).passable.nonzero()
-    cells = blocked.nonzero()
-    gap = ((passable[:, None] - cells).abs() - 1).clamp_min(0).double().square().sum(-1).sqrt() * CELL
-    nearest = float(gap.amin(1).min())
-    assert len(passable) > 1000
-    assert RADIUS + CELL / 2 - 1e-6 <= nearest < RADIUS + CELL
-
-
 def test_only_staying_is_feasible_in_unknown_space():
     state = torch.tensor([0.1, 0.1, 0.1, 0.0, 0, 0, 0], dtype=torch.float64)
     elsewhere = known(torch.zeros(SHAPE, dtype=torch.bool), LOW + 10_000)

@@ -14,9 +14,7 @@ from scipy import stats
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.occupancy.forms.monte_carlo import RayBundle
-from gmmtorch.occupancy.voxels.cells import Box
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.occupancy import Box, RayBundle, cast_evidence
 from gmmtorch.team.exploration.robot import component_rays as module
 from gmmtorch.team.exploration.robot.component_rays import (
     RayRule,
@@ -38,11 +36,6 @@ def component_rays(
     seen = counted_viewpoints(components, resolution)
     number = ray_numbers(components, seen, rule)
     return drawn_rays(components, seen, rule, number, torch.ones_like(seen))[0]
-
-
-def rows_of(rays) -> set[tuple[float, ...]]:
-    table = torch.cat([rays.origins, rays.ends, rays.weights[:, None], rays.is_hit[:, None].double()], 1)
-    return set(map(tuple, table.tolist()))
 
 
 # -- distribution ---------------------------------------------------------------------------------
@@ -116,23 +109,6 @@ def test_draws_of_equal_components_are_independent():
         assert stats.kstest(ends[:, axis], "norm").pvalue > 1e-3
         assert abs(np.corrcoef(ends[:-1, axis], ends[1:, axis])[0, 1]) < 0.15
         assert abs(np.corrcoef(ends[:, axis], ends[:, axis - 1])[0, 1]) < 0.15
-
-
-# -- independence ---------------------------------------------------------------------------------
-
-
-def test_rays_do_not_depend_on_other_components():
-    components = random_components(3, k=40, seed=5)
-    together = rows_of(component_rays(components, 0.2))
-    alone = [rows_of(component_rays(components.selected(torch.tensor([k])), 0.2)) for k in range(40)]
-    assert set().union(*alone) == together  # to the last bit
-    assert sum(map(len, alone)) == len(together)
-    order = torch.randperm(40, generator=torch.Generator().manual_seed(0))
-    assert rows_of(component_rays(components.selected(order), 0.2)) == together
-    pairs = Components.concatenate([components.selected(order[:7]), components.selected(order[7:])])
-    assert rows_of(component_rays(pairs, 0.2)) == together
-    renamed = replace(components, ids=components.ids + 1)
-    assert rows_of(component_rays(renamed, 0.2)) != together
 
 
 # -- evidence -------------------------------------------------------------------------------------

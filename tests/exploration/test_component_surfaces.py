@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from exploration.ray_cases import EVERYTHING, dense, evidence_of, one
+from exploration.ray_cases import dense, evidence_of, one
 from mapping.random_components import normal_components
 from torch import Tensor
 
@@ -101,33 +101,6 @@ def test_a_sensor_within_the_shell_frees_no_cells() -> None:
     evidence = evidence_of(component, RESOLUTION, AROUND, shell=1.0)
     assert float(evidence.misses.sum()) == 0
     assert float(evidence.hits.sum()) == pytest.approx(1000.0)
-
-
-# -- hits drawn more densely ----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("shell", [0.0, 1.0])
-def test_hits_per_ray_does_not_change_the_misses(shell: float) -> None:
-    components = normal_components(25, 3, seed=2, empty=0.3)
-    once, often = (
-        evidence_of(components, RESOLUTION, EVERYTHING, shell=shell, hits_per_ray=n) for n in (1, 8)
-    )
-    missed = [dict(zip(map(tuple, e.cells.tolist()), e.misses.tolist(), strict=True)) for e in (once, often)]
-    for cell in missed[0].keys() | missed[1].keys():
-        assert missed[0].get(cell, 0.0) == pytest.approx(missed[1].get(cell, 0.0), rel=1e-5)
-
-
-def test_denser_hits_are_more_accurate() -> None:
-    near = Box(torch.tensor([-15, -25, -25]), torch.tensor([60, 35, 35]))
-    errors: dict[int, float] = {1: 0.0, 8: 0.0}
-    for number in range(6):
-        component, _, _ = sheet(*VIEWS["tilted"])
-        component = replace(component, ids=torch.tensor([[1, number]]))
-        limit = dense(evidence_of(component, RESOLUTION, near, least=50_000, most=50_000), near)[0]
-        for n in errors:
-            hits = dense(evidence_of(component, RESOLUTION, near, hits_per_ray=n), near)[0]
-            errors[n] += float((hits - limit).abs().sum()) / 6
-    assert 0 < errors[8] < 0.5 * errors[1]
 
 
 # -- fewer rays near the sensor -------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from exploration.rooms import plan_ahead
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -20,7 +21,6 @@ from gmmtorch.team.exploration.mission.mission import COORDINATIONS, coordinate,
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, clear_of, predicted_path
 from gmmtorch.team.exploration.planning.planner_interface import Plan
-from gmmtorch.team.sharing.messages.mission_messages import PlanMessage
 
 Choices = list[list[frozenset[int]]]
 """Of each robot, the sets that it may cover."""
@@ -183,12 +183,9 @@ def test_later_shifts_the_paths():
 
 
 @pytest.mark.parametrize("paths", [torch.zeros(2, 3), torch.zeros(2, 0, 3), torch.full((1, 1, 3), math.nan)])
-def test_peer_trajectories_reject_nonfinite_paths(paths):
+def test_peer_trajectories_reject_nonfinite_paths_and_bad_separations(paths):
     with pytest.raises(InvalidArgumentError, match="paths"):
         PeerTrajectories(paths)
-
-
-def test_peer_trajectories_reject_bad_separation():
     with pytest.raises(InvalidArgumentError, match="separation="):
         PeerTrajectories.of([], 0.0)
 
@@ -196,16 +193,9 @@ def test_peer_trajectories_reject_bad_separation():
 # -- plans that were heard --------------------------------------------------------------------------------
 
 
-def plan(n: int, step: float) -> PlanMessage:
-    """A plan of n poses along x, one metre apart."""
-    path = torch.zeros(n, 4, dtype=torch.float64)
-    path[:, 0] = torch.arange(1, n + 1)
-    return PlanMessage(1, 0, 0.0, step, path, torch.zeros(0, 4))
-
-
 def test_a_predicted_path_is_the_rest_of_a_plan() -> None:
     def xs(age: float, step: float = 0.2, of: float = 0.2, n: int = 6) -> list[float]:
-        ahead = predicted_path(plan(n, of), age, step)
+        ahead = predicted_path(plan_ahead(n, of), age, step)
         assert (ahead[:, 1:] == 0).all()
         return pytest.approx(ahead[:, 0].tolist())
 
@@ -227,7 +217,7 @@ def test_a_predicted_path_is_the_rest_of_a_plan() -> None:
 def test_a_predicted_path_is_where_a_robot_of_constant_speed_is(
     n: int, of: float, step: float, age: float
 ) -> None:
-    ahead = predicted_path(plan(n, of), age, step)[:, 0]
+    ahead = predicted_path(plan_ahead(n, of), age, step)[:, 0]
     times = age + step * torch.arange(1, len(ahead) + 1, dtype=torch.float64)
     assert (times[-1] >= n * of - 1e-6) or len(ahead) == 1000
     there = (times / of).clamp_max(n) if n > 1 else torch.ones(len(ahead), dtype=torch.float64)
@@ -296,14 +286,16 @@ def calls(log: list[tuple[str, int, Any]], name: str) -> list[tuple[int, Any]]:
 
 @every_coordination
 @seeds
-def test_all_robots_take_snapshots_before_planning_and_send_views_after(name: str, seed: int) -> None:
-    _, log, plans = taken(name, seed)
+def test_all_robots_take_snapshots_before_planning_follow_their_last_proposal_and_send_views(name, seed):
+    agents, log, plans = taken(name, seed)
     assert log[:N] == [("begin_planning", robot, (NOW,)) for robot in range(N)]
     assert log[-N:] == [("send_views", robot, (NOW,)) for robot in range(N)]
     assert calls(log, "follow") == [(robot, ()) for robot in plans]
     last = max(row for row, (what, *_) in enumerate(log) if what == "propose")
     assert min(row for row, (what, *_) in enumerate(log) if what == "follow") > last
     assert len(log) == 4 * N + 2 * len(calls(log, "propose"))
+    for robot, plan in plans.items():
+        assert plan.path[0, 0] == 100 * robot + len(agents[robot].peers)
 
 
 @every_coordination
@@ -323,14 +315,6 @@ def test_a_plan_is_sent_once_and_before_later_robots_listen(name: str, seed: int
             assert robot not in fixed
             assert about == (pytest.approx(NOW + len(fixed) * OPTIONS.plan_slack),)
     assert OPTIONS.plan_slack > 2 * OPTIONS.latency
-
-
-@every_coordination
-@seeds
-def test_each_robot_follows_its_last_proposal(name: str, seed: int) -> None:
-    agents, _, plans = taken(name, seed)
-    for robot, plan in plans.items():
-        assert plan.path[0, 0] == 100 * robot + len(agents[robot].peers)
 
 
 @every_coordination

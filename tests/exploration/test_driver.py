@@ -11,15 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.exploration.mission.driver import (
-    Drivable,
-    Run,
-    SimulatedClock,
-    Stopwatch,
-    WallClock,
-    drive,
-    settle,
-)
+from gmmtorch.team.exploration import Drivable, Stopwatch, WallClock, drive, settle
+from gmmtorch.team.exploration.mission.driver import Run, SimulatedClock
 
 
 class Toy:

@@ -28,24 +28,19 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.fitting import fit_window
-from gmmtorch.mapping.learning.merging import all_origins
-from gmmtorch.mapping.learning.novelty import beam_novelty, count_explained
-from gmmtorch.occupancy.voxels.cells import intersection
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.mapping import Components, all_origins, beam_novelty, count_explained, fit_window
+from gmmtorch.occupancy import RollingWindow, intersection
 from gmmtorch.scan import Scan
 from gmmtorch.simulation.robot_camera import DepthFrame
 from gmmtorch.team.exploration.mission.options import FrameRule
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, GmmMapper, Memo
+from gmmtorch.team.sharing import Replica, decode
 from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
     encode_components,
     encode_counts,
 )
-from gmmtorch.team.sharing.messages.message_registry import decode
-from gmmtorch.team.sharing.replica.replica import Replica
 
 Flight = tuple[GmmMapper, list[FrameUpdate], list[bytes]]
 
@@ -151,10 +146,9 @@ def test_component_support_equals_the_number_of_novel_beams() -> None:
     assert held.origins[held.seen_from].unique(dim=0).tolist() == [list(PLACES[0][0])]
 
 
-def test_the_order_of_messages_does_not_matter(broadcast_flight: tuple) -> None:
+def test_the_order_of_messages_does_not_matter(broadcast_flight: tuple, generator: torch.Generator) -> None:
     one, _, said = broadcast_flight
     components, counts = by_kind(said)
-    generator = torch.Generator().manual_seed(0)
 
     def shuffled(datagrams: list[bytes]) -> list[bytes]:
         return [datagrams[i] for i in torch.randperm(len(datagrams), generator=generator).tolist()]

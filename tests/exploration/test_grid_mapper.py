@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import pytest
 import torch
+from exploration.mapped_room import heard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.mapping.learning.novelty import beam_novelty
-from gmmtorch.mapping.learning.rules import NoveltyRule
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.mapping import NoveltyRule, beam_novelty
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence
 from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
 from gmmtorch.team.exploration.mission.options import TeamOptions
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo, novel_beams
 from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.sharing import PointsMessage, decode
 from gmmtorch.team.sharing.broadcast import MOST_INTERVALS
-from gmmtorch.team.sharing.messages.message_registry import decode
-from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM, PointsMessage, encode_points
-from gmmtorch.team.sharing.radio import ReceivedMessage
+from gmmtorch.team.sharing.messages.mission_messages import POINTS_PER_DATAGRAM, encode_points
 
 RULE = NoveltyRule(resolution=0.2, observed=0.5)
 WITHIN = Box(torch.tensor([-7, -30, -5]), torch.tensor([9, 30, 6]))
@@ -165,10 +162,6 @@ def believed(one: GridMapper) -> Tensor:
     return torch.stack(one.belief.grid.dense(BOX))
 
 
-def heard(*datagrams: bytes, sender: int = 1) -> list[ReceivedMessage]:
-    return [ReceivedMessage(sender, datagram, decode(datagram)) for datagram in datagrams]
-
-
 def said(view: DepthFrame, sender: int = 1, number: int = 0) -> list[bytes]:
     return encode_points(sender, number, view.origin, view.ends, view.is_hit)
 
@@ -285,9 +278,8 @@ def test_memory_is_bounded_for_invented_frame_numbers(monkeypatch: pytest.Monkey
 # -- the window -----------------------------------------------------------------------------------------
 
 
-def test_a_moving_window_equals_a_new_cast() -> None:
+def test_a_moving_window_equals_a_new_cast(generator: torch.Generator) -> None:
     one = mapper(shape=(12, 16, 10))
-    generator = torch.Generator().manual_seed(0)
     position, views = MIDDLE, []
     for seed in range(12):
         step = 0.7 * torch.randn(3, generator=generator, dtype=torch.float64)

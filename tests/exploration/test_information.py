@@ -179,8 +179,7 @@ def both(occupancy, depths):
 
 
 @pytest.mark.parametrize("n_cells", [64, 400])
-def test_csqmi_in_float32_is_accurate_for_long_beams(n_cells):
-    generator = torch.Generator().manual_seed(0)
+def test_csqmi_in_float32_is_accurate_for_long_beams(n_cells, generator):
     rows = torch.rand(5, n_cells, generator=generator, dtype=torch.float64)
     rows = torch.cat([rows, rows**6, torch.full((1, n_cells), 0.5), torch.full((1, n_cells), 0.125)])
     rows[::2, ::7] = 0
@@ -195,10 +194,9 @@ def test_csqmi_in_float32_is_accurate_for_long_beams(n_cells):
 
 
 @pytest.mark.parametrize("prior", [0.125, 0.5, None])
-def test_needed_band_follows_the_depths(prior):
+def test_needed_band_follows_the_depths(prior, generator):
     """Cells 1 cm apart in one part of a beam and 20 cm in the other: the chosen band is as good as none."""
     depths = torch.cat([torch.arange(20) * 0.01, 0.2 + torch.arange(20) * 0.2]).double()
-    generator = torch.Generator().manual_seed(0)
     occupancy = (
         torch.rand(50, 40, generator=generator, dtype=torch.float64)
         if prior is None

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from exploration.replays import FakeTime, Together
-from exploration.rooms import SHELF, SMALL, room, small_room, without_seconds
+from exploration.rooms import SHELF, SMALL, plan_ahead, room, small_room, without_seconds
 from kernels_of_gpu import kernels_of_gpu
 from mapping.map_cases import assert_same_components
 from pretended_gpu import GPUTensor, pretended_gpu
@@ -21,8 +21,7 @@ from pretended_gpu import GPUTensor, pretended_gpu
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels import kernels
 from gmmtorch.mapping.components import Components
-from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.robot_camera import DepthCamera
+from gmmtorch.simulation import DepthCamera, box
 from gmmtorch.team.cli.explorations import _coverage, _team_view
 from gmmtorch.team.exploration.mission.driver import SimulatedClock, Stopwatch, WallClock, drive, settle
 from gmmtorch.team.exploration.mission.mission import Mission
@@ -33,11 +32,7 @@ from gmmtorch.team.exploration.mission.trials import assemble, make_agent, start
 from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories
 from gmmtorch.team.exploration.robot.agent import StoppingRule
 from gmmtorch.team.exploration.world.world import World
-from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.link_conditions import Partition
-from gmmtorch.team.sharing.transport.udp import UdpTransport
+from gmmtorch.team.sharing import Partition, PlanMessage, Replica, Store, UdpTransport, encode_plan
 
 CONTRACT = """
 framework seed world n_robots duration times entropy_bits entropy_bits_per_robot observable_bits
@@ -306,13 +301,6 @@ def hall() -> World:
     return small_room()
 
 
-def plan(n: int, step: float = 0.2, sender: int = 1) -> PlanMessage:
-    """A plan of n poses along x, one metre apart."""
-    path = torch.zeros(n, 4, dtype=torch.float64)
-    path[:, 0] = torch.arange(1, n + 1)
-    return PlanMessage(sender, 0, 0.0, step, path, torch.zeros(0, 4))
-
-
 def test_two_processes_hold_the_map_of_one_process_that_received_everything(hall, tmp_path, monkeypatch):
     fake, observer = FakeTime(), Replica(9, dim=3)
     clock = WallClock(clock=fake, sleep=fake.sleep)
@@ -378,7 +366,7 @@ def planned_beside(
 
 def test_a_robot_avoids_the_paths_that_it_has_heard(hall, monkeypatch):
     with transports(1) as (link,):
-        heard = [plan(10, sender=4), plan(3, sender=2)]
+        heard = [plan_ahead(10, sender=4), plan_ahead(3, sender=2)]
         seen = planned_beside(mission_of(0, hall, TEAM, link), heard, 0.4, monkeypatch)
     ahead = torch.tensor([[3.0] * 8, [3, 4, 5, 6, 7, 8, 9, 10]], dtype=torch.float64)
     assert torch.allclose(seen["peers"].paths[..., 0], ahead)
@@ -402,7 +390,7 @@ def test_views_are_sent_once_every_planning_period(hall, monkeypatch):
 
 def test_a_duplicate_id_is_reported_with_its_address(hall, monkeypatch):
     monkeypatch.setattr("gmmtorch.team.sharing.transport.security.FRESH_SECONDS", 0.1)
-    path = plan(4).path
+    path = plan_ahead(4).path
     with UdpTransport.unicast(0) as link, UdpTransport.unicast(0, peers=[link.address]) as other:
         mission = mission_of(0, hall, TEAM, link)
         view = FlyingRobotView(mission, link)

@@ -17,14 +17,7 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, OutputError
 from gmmtorch.simulation.furniture import box
 from gmmtorch.team.exploration.mission import trials as trials_module
-from gmmtorch.team.exploration.mission.trials import (
-    ROW,
-    STAGE,
-    Trial,
-    WorldOptions,
-    run_mission,
-    run_trials,
-)
+from gmmtorch.team.exploration.mission.trials import ROW, STAGE, Trial, WorldOptions, run_mission, run_trials
 
 ROOM = box((0.1, 0.1, 0.1), (6.1, 5.1, 3.1))
 

@@ -112,10 +112,9 @@ def test_tree_planner_travels_to_a_distant_view():
     assert len(kinds) < 14
 
 
-def test_journey_ends_without_progress():
+def test_journey_ends_without_progress(generator):
     explorer = Explorer.at(hollow(30, 20, 13), (1.2, 1.2, 1.2, 0.0))
     explorer.know_all()
-    generator = torch.Generator().manual_seed(0)
     pose = torch.tensor([50.0, 50.0, 1.2, 0.0], dtype=torch.float64)
     journey = Journey(pose, 9.0, 60.0, 0.0)
     assert journey.goal(explorer.task(generator), 1.0) is not None
@@ -179,8 +178,7 @@ def half_known() -> LocalMap:
     return LocalMap(torch.zeros(3).long(), RESOLUTION, free.float(), observed, free, passable)
 
 
-def test_frontier_cells_are_free_cells_next_to_unknown_ones():
-    generator = torch.Generator().manual_seed(0)
+def test_frontier_cells_are_free_cells_next_to_unknown_ones(generator):
     observed = torch.rand(7, 6, 5, generator=generator) < 0.6
     free = (torch.rand(7, 6, 5, generator=generator) < 0.5) & observed
     free[0, 0, 0], observed[0, 0, 0] = True, False  # known to be free without having been seen

@@ -18,20 +18,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from own_process import answer_of
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import DatasetShard, shard_indices, start_frame
-from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.scan import Scan
-from gmmtorch.team.exploration.mission.driver import WallClock, settle
-from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.exploration.mission.robot_view import ReplayingRobotView
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.shared_map import FrameJoiner
-from gmmtorch.team.sharing.transport.security import TeamKey
-from gmmtorch.team.sharing.transport.simulated_network import LinkConditions, Network
-from gmmtorch.team.sharing.transport.udp import UdpTransport
+from gmmtorch import GaussianMap, GmmTorchError, IncrementalRule, Scan
+from gmmtorch.datasets import DatasetShard, load, shard_indices, start_frame
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.team.exploration import ReplayingRobotView, ReplayMission, WallClock, settle
+from gmmtorch.team.sharing import FrameJoiner, Network, Replica, TeamKey, UdpTransport
+from gmmtorch.team.sharing.transport.simulated_network import LinkConditions
 
 
 def n_missing(mission: ReplayMission) -> int:

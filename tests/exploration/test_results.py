@@ -17,17 +17,9 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.team.exploration.mission.options import TeamOptions
-from gmmtorch.team.exploration.mission.results import (
-    VARIANT,
-    Snapshots,
-    differing,
-    mission_row,
-    variant_of,
-    with_network_costs,
-    with_times,
-)
-from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule, accuracy, disagreement
+from gmmtorch.team.exploration import BeliefRule, Snapshots, TeamOptions, differing, variant_of
+from gmmtorch.team.exploration.mission.results import VARIANT, mission_row, with_network_costs, with_times
+from gmmtorch.team.exploration.world.scoring import BeliefMap, accuracy, disagreement
 from gmmtorch.team.sharing.transport.simulated_network import Reception, Traffic
 
 OPTIONS = {

@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow
 from gmmtorch.simulation.robot_camera import DepthCamera, DepthFrame
-from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.options import TeamOptions
+from gmmtorch.team.exploration import Agent, BeliefRule, Mission, TeamOptions, World
 from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.planning.collision_checking import PeerTrajectories, cells_in_sphere
 from gmmtorch.team.exploration.planning.planner_interface import (
@@ -31,11 +29,10 @@ from gmmtorch.team.exploration.planning.planner_interface import (
     retreat,
     shortened,
 )
-from gmmtorch.team.exploration.robot.agent import Agent, Robot, StoppingCriterion, StoppingRule
+from gmmtorch.team.exploration.robot.agent import Robot, StoppingCriterion, StoppingRule
 from gmmtorch.team.exploration.robot.mapper import GridMapper, Memo
-from gmmtorch.team.exploration.world.scoring import BeliefMap, BeliefRule
+from gmmtorch.team.exploration.world.scoring import BeliefMap
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
-from gmmtorch.team.exploration.world.world import World
 
 BOX = Box(torch.tensor([0, 0, 0]), torch.tensor([32, 32, 16]))
 WINDOW = (32, 32, 16)

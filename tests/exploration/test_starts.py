@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.simulation.furniture import box
-from gmmtorch.team.exploration.mission.driver import SimulatedClock, drive
-from gmmtorch.team.exploration.mission.mission import Mission
-from gmmtorch.team.exploration.mission.trials import assemble, start_poses
+from gmmtorch.team.exploration import Mission, World, drive, start_poses
+from gmmtorch.team.exploration.mission.driver import SimulatedClock
+from gmmtorch.team.exploration.mission.trials import assemble
 from gmmtorch.team.exploration.planning.collision_checking import cells_in_sphere
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world import starts
 from gmmtorch.team.exploration.world.starts import initial_free_space
-from gmmtorch.team.exploration.world.world import World
 
 PRIMITIVES = Primitives(Dynamics())
 ALONE = replace(SMALL, framework="grid_isolated", size=1)

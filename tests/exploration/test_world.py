@@ -11,10 +11,8 @@ from exploration.rooms import HALL
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
-from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.mesh_world import MeshWorld
+from gmmtorch.occupancy import Box, cast_evidence, occupied_cells
+from gmmtorch.simulation import MeshWorld, box
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world.starts import check_start, start_poses
 from gmmtorch.team.exploration.world.world import (

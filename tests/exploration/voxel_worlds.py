@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gmmtorch.occupancy.voxels.cells import Box
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
+from gmmtorch.occupancy import Box, cast_evidence
 from gmmtorch.team.exploration.planning.collision_checking import (
     LocalMap,
     PeerTrajectories,

@@ -10,8 +10,7 @@ import torch
 import yaml
 from PIL import Image
 
-from gmmtorch.occupancy.evidence import Thresholds
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy import Thresholds, VoxelGrid
 
 
 def random_probabilities(shape: tuple[int, ...], seed: int = 0) -> torch.Tensor:

@@ -15,8 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, NumericalError
-from gmmtorch.export import mixture_formats
-from gmmtorch.export.mixture_formats import PlainMixture, read_gira_csv, read_npz, write_gira_csv, write_npz
+from gmmtorch.export import PlainMixture, mixture_formats, read_gira_csv, read_npz, write_gira_csv, write_npz
 
 
 def random_mixture(

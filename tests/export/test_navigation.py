@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gmmtorch import Components, OccupancyGrid, Scan, VoxelGrid
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.navigation import (
     Levels,
@@ -24,11 +25,7 @@ from gmmtorch.export.navigation import (
     write_distance_field,
     write_map_server,
 )
-from gmmtorch.mapping.components import Components
 from gmmtorch.occupancy.evidence import Thresholds
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
-from gmmtorch.scan import Scan
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 99), st.sampled_from([1e-5, 0.05, 12.0]))

@@ -11,8 +11,7 @@ from export.map_examples import example_grid, random_probabilities
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.point_cloud import CellCloud, write_octomap
-from gmmtorch.occupancy.evidence import CellClass, Thresholds
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import CellClass, SparseEvidence, Thresholds
 
 pyoctomap = pytest.importorskip("pyoctomap")
 

@@ -9,19 +9,12 @@ from kernels_of_gpu import kernels_of_gpu
 from pretended_gpu import GPUTensor, pretended_gpu
 
 import gmmtorch as gt
-from gmmtorch.kernels import kernels
-from gmmtorch.kernels.rays.ray_traversal import traverse
+from gmmtorch import Evidence, VoxelGrid
+from gmmtorch.kernels import kernels, traverse
 from gmmtorch.linalg import on_cpu
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.truncated import Rows, group_rows, truncated_expectation
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.flux import flux_evidence
-from gmmtorch.occupancy.forms.point import point_evidence
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.cells import Box
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import Box, Cones, SparseEvidence, cast_evidence, flux_evidence, point_evidence
 
 pytestmark = pytest.mark.cpu_only
 

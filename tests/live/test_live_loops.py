@@ -18,22 +18,13 @@ pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
 from localization.looping_robot import BACK, DriftingOdometry, lap, off_the_walls
 
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import Topic
-from gmmtorch.datasets.ros.bag_topics import LASER, Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
-from gmmtorch.live import live_scans
-from gmmtorch.live.live_mapper import LiveMapper
-from gmmtorch.live.live_scans import LiveOptions, LiveScans
-from gmmtorch.live.ros import Node
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule
-from gmmtorch.team.sharing import Replica
+from gmmtorch.datasets import LASER, Ranges, Sensor, Topic, TransformTree
+from gmmtorch.live import LiveMapper, LiveScans, Node, live_scans
+from gmmtorch.live.live_scans import LiveOptions
+from gmmtorch.mapping import Components, GaussianMap, IncrementalRule
+from gmmtorch.team.sharing import Network, Replica, SharedMap, Store
 from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.store import Store
-from gmmtorch.team.sharing.transport.simulated_network import LinkConditions, Network
+from gmmtorch.team.sharing.transport.simulated_network import LinkConditions
 
 N_SCANS = 58
 NEAR = 0.15

@@ -17,25 +17,16 @@ pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from test_live_scans import laser, recorded
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import Topic
-from gmmtorch.datasets.ros.bag_topics import CLOUD, LASER, Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch.datasets import CLOUD, LASER, Ranges, Sensor, Topic, TransformTree, load
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError, told
-from gmmtorch.live.bag_player import BagPlayer
-from gmmtorch.live.live_mapper import LiveMapper
-from gmmtorch.live.live_scans import LiveOptions, LiveScans, find_sensor, open_scans
-from gmmtorch.live.publishers import Diagnostics, MapPublisher
-from gmmtorch.live.ros import Node, Quality
+from gmmtorch.live import BagPlayer, LiveMapper, LiveScans, MapPublisher, Node, find_sensor, open_scans
+from gmmtorch.live.live_scans import LiveOptions
+from gmmtorch.live.publishers import Diagnostics
+from gmmtorch.live.ros import Quality
 from gmmtorch.live.ros.topics import LATCHED
-from gmmtorch.mapping import Attributes, Numbers
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.map_builder import MapBuilder
+from gmmtorch.mapping import Attributes, GaussianMap, MapBuilder, Numbers
 from gmmtorch.scan import Scan
-from gmmtorch.team.sharing import Replica
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.transport.simulated_network import Network
+from gmmtorch.team.sharing import Network, Replica, SharedMap
 
 LASER_TYPE, GRID = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/OccupancyGrid"
 

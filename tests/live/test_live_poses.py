@@ -7,23 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from sensor_bags import moved
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 pytest.importorskip("cyclonedds", reason="needs the extra [ros]: cyclonedds")
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import Topic
-from gmmtorch.datasets.ros.bag_topics import LASER, Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch import GaussianMap, Scan
+from gmmtorch.datasets import LASER, Ranges, Sensor, Topic, TransformTree, load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.export.bag import transform_fields
-from gmmtorch.live import live_scans, publishers
-from gmmtorch.live.live_mapper import LiveLocalizer, LiveMapper
-from gmmtorch.live.live_scans import LiveOptions, LiveScans
-from gmmtorch.live.ros import Node, Quality
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.scan import Scan
+from gmmtorch.live import LiveLocalizer, LiveMapper, LiveScans, Node, live_scans, publishers
+from gmmtorch.live.live_scans import LiveOptions
+from gmmtorch.live.ros import Quality
 
 N_BEAMS = 180
 ANGLES = np.linspace(-np.pi, np.pi, N_BEAMS, endpoint=False)
@@ -52,16 +47,9 @@ def laser(stamp: float, ranges: np.ndarray) -> dict[str, Any]:
     return {"header": header, **about, "time_increment": 0.0, "ranges": ranges.astype(np.float32)}
 
 
-def pose(x: float, y: float, yaw: float) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    matrix[:2, 3] = x, y
-    return matrix
-
-
 DRIVE = [(1.5 + 0.1 * i, 1.5 + 0.03 * i, 0.05 * i) for i in range(12)]
 PATH = DRIVE[:8]
-FIRST = pose(*DRIVE[0])
+FIRST = moved(*DRIVE[0][:2], yaw=DRIVE[0][2])
 
 
 def live(tree: TransformTree, **options: Any) -> LiveScans:
@@ -88,7 +76,7 @@ def node(ros_options):
 
 def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypatch):
     monkeypatch.setattr(live_scans, "SETTLING", 0.0)
-    odom_in_map = pose(1.0, 0.5, 0.3)
+    odom_in_map = moved(1.0, 0.5, yaw=0.3)
     scans = live(node.transforms, poses="tf", frame="odom")
     sent: dict[str, list[Any]] = {"pose": [], "/tf": [], "/diagnostics": []}
     monkeypatch.setattr(
@@ -96,7 +84,7 @@ def test_poses_and_the_transform_to_odometry_are_published(node, known, monkeypa
     )
     localizer = LiveLocalizer(node, scans, known)
     for index, at in enumerate(PATH):
-        in_odom = np.linalg.inv(odom_in_map) @ pose(*at)
+        in_odom = np.linalg.inv(odom_in_map) @ moved(*at[:2], yaw=at[2])
         message = transform_fields({("odom", "laser"): in_odom})
         message["transforms"][0]["header"]["stamp"] = {"sec": index, "nanosec": 0}
         node.transforms.add(message, static=False)
@@ -144,7 +132,7 @@ def test_a_map_of_another_dimension_is_refused(node):
 
 def is_near(found: np.ndarray, at: tuple[float, float, float]) -> bool:
     """Whether a pose in the frame of the first scan is that of the path, to 3 cm and 1.5°."""
-    off = np.linalg.inv(FIRST @ found) @ pose(*at)
+    off = np.linalg.inv(FIRST @ found) @ moved(*at[:2], yaw=at[2])
     return bool(np.linalg.norm(off[:2, 3]) < 0.03 and abs(np.arctan2(off[1, 0], off[0, 0])) < 0.026)
 
 

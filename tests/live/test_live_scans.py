@@ -11,13 +11,9 @@ import torch
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
-from sensor_bags import BagWriter
+from sensor_bags import BagWriter, moved
 
-from gmmtorch.datasets import load
-from gmmtorch.datasets.base import Ranges
-from gmmtorch.datasets.ros.bag_reader import BagReader, Topic
-from gmmtorch.datasets.ros.bag_topics import CLOUD, DEPTH, LASER, Sensor
-from gmmtorch.datasets.ros.transform_tree import TransformTree
+from gmmtorch.datasets import CLOUD, DEPTH, LASER, BagReader, Ranges, Sensor, Topic, TransformTree, load
 from gmmtorch.errors import told
 from gmmtorch.live import live_scans
 from gmmtorch.live.live_scans import DROPPED, LiveOptions, LiveScans
@@ -42,13 +38,6 @@ def clock(monkeypatch) -> Clock:
     return made
 
 
-def pose(x: float, yaw: float = 0.0) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    matrix[0, 3] = x
-    return matrix
-
-
 def recorded(path: Path, kind: str) -> Path:
     """A drive of three seconds with a turn, TF at 20 Hz, and a sensor at 5 Hz with times of its points."""
     rng = np.random.default_rng(0)
@@ -56,7 +45,7 @@ def recorded(path: Path, kind: str) -> Path:
         bag.transforms(0.0, {("base", "sensor"): np.eye(4)}, static=True)
         for tick in range(61):
             time = tick / 20
-            bag.transforms(time, {("odom", "base"): pose(time, time / 2)})
+            bag.transforms(time, {("odom", "base"): moved(time, yaw=time / 2)})
             if tick % 4 == 1:
                 stamp = time - 0.013
                 if kind == LASER:
@@ -120,7 +109,7 @@ def test_points_with_wrong_times_are_dropped_and_counted_as_in_the_recording(tmp
     rng = np.random.default_rng(0)
     with BagWriter(tmp_path / "a.mcap") as bag:
         for tick in range(61):
-            bag.transforms(tick / 20, {("odom", "sensor"): pose(tick / 20, tick / 40)})
+            bag.transforms(tick / 20, {("odom", "sensor"): moved(tick / 20, yaw=tick / 40)})
             if 0 < tick < 58 and tick % 2:
                 table = np.zeros(200, [*((axis, "<f4") for axis in "xyz"), ("time", "<f8")])
                 table["x"], table["y"], table["z"] = rng.normal(0, 3, (3, 200))

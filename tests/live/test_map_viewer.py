@@ -17,16 +17,13 @@ from scipy.spatial.transform import Rotation
 from gmmtorch.datasets import load
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.live import viewer_scene
-from gmmtorch.mapping import Attributes, Labels, Numbers
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query
+from gmmtorch.live.map_viewer import MapViewer, admits
+from gmmtorch.mapping import Attributes, GaussianMap, Labels, Numbers, Query
 from gmmtorch.report.ellipsoids import unit_sphere
 from gmmtorch.scan import display_colours
 
 pytest.importorskip("viser")
 from viser_client import Client
-
-from gmmtorch.live.map_viewer import MapViewer, admits
 
 
 @pytest.fixture(scope="module")

@@ -13,16 +13,14 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, arg
 from gmmtorch.export.bag import cloud_fields, transform_fields
-from gmmtorch.live.ros import Node
+from gmmtorch.live.ros import Node, zenoh_middleware
 from gmmtorch.live.ros.dds import _settings
 from gmmtorch.live.ros.node import reading
+from gmmtorch.live.ros.topics import Endpoint, MessageTypes, Quality, dds_type, mismatch, ros_type
 
 pytest.importorskip("rosbags", reason="needs the extra [ros]: rosbags")
 
 from rosbags.typesys import Stores, get_typestore
-
-from gmmtorch.live.ros import zenoh_middleware
-from gmmtorch.live.ros.topics import Endpoint, MessageTypes, Quality, dds_type, mismatch, ros_type
 
 TYPES = MessageTypes()
 STORE = get_typestore(Stores.ROS2_JAZZY)

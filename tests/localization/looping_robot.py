@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gmmtorch.localization import Location, Odometry
 from gmmtorch.localization.local_map import Keyframe
-from gmmtorch.localization.location import Location
-from gmmtorch.localization.odometry import Odometry
 from gmmtorch.pose import Pose
 
 N_BEAMS = 180

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from gmmtorch.datasets import POINT_TIMES, deskewed, load
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization import Odometry, with_odometry
-from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
+from gmmtorch.localization import Odometry, absolute_trajectory_error, with_odometry
 from gmmtorch.pose import Pose
 from tests.sensor_bags import BagWriter
 

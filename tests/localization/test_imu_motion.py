@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from sensor_bags import BagWriter
 from torch import Tensor
 
+from gmmtorch import GaussianMap, Scan
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.localization import Odometry, Tracker, with_odometry
@@ -21,9 +22,7 @@ from gmmtorch.localization.location import continued
 from gmmtorch.localization.odometry import Trajectory
 from gmmtorch.localization.tracker import locate_scans
 from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
-from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.pose import Pose
-from gmmtorch.scan import Scan
 
 TURN, STEP, SECONDS, RATE = math.radians(60), 0.3, 0.5, 100
 """Of each step of the robot in the room: rad, m, s; and messages of its IMU a second."""

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.localization import Odometry, with_odometry
+from gmmtorch.localization import Odometry, absolute_trajectory_error, with_odometry
 from gmmtorch.localization.alignment import align
 from gmmtorch.localization.local_map import Keyframe, LocalMap
 from gmmtorch.localization.odometry import _RULE, _bridged
 from gmmtorch.localization.pose_search import Expectation
-from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
 from gmmtorch.pose import Pose
 
 N_2D, N_3D = 14, 6

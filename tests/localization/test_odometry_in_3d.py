@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.localization import Odometry
-from gmmtorch.localization.trajectory_errors import absolute_trajectory_error
+from gmmtorch.localization import Odometry, absolute_trajectory_error
 from gmmtorch.pose import Pose
 
 ROOM = torch.tensor([7.0, 4.5, 1.8]).double()  # half of its sides, metres

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
 from gmmtorch.localization.registration import Ascent, overlap, register, yaw_starts
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import Components, GaussianMap
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.pose import Pose, generators
 

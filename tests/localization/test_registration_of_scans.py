@@ -11,10 +11,8 @@ from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.localization.registration import register
+from gmmtorch.mapping import Components, WindowedRule, learn_window
 from gmmtorch.mapping.codec import component_batch as codec
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windows import learn_window
 from gmmtorch.pose import generators
 
 pytestmark = [pytest.mark.slow, pytest.mark.real_data]

@@ -10,8 +10,7 @@ from torch import Tensor
 
 import gmmtorch as gt
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.localization import Tracker
-from gmmtorch.localization.tracker import clock_faults, locate_scans
+from gmmtorch.localization import Tracker, clock_faults, locate_scans
 from gmmtorch.pose import generators
 
 

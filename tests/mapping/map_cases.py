@@ -12,10 +12,9 @@ from mapping.random_components import estimated_bytes
 from occupancy.protocol_contract import RESOLUTION, move, open_scan, shifted, wall_scan
 from torch import Tensor
 
-from gmmtorch.mapping.components import TENSORS, Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import Components, GaussianMap, IncrementalRule, LearningRule, WindowedRule
+from gmmtorch.mapping.components import TENSORS
 from gmmtorch.mapping.learning.merging import united
-from gmmtorch.mapping.learning.rules import IncrementalRule, LearningRule, WindowedRule
 from gmmtorch.mapping.learning.windows import absorb
 from gmmtorch.mixture import MergedInRounds, merge_components
 from gmmtorch.scan import Scan

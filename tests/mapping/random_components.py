@@ -8,9 +8,8 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
+from gmmtorch.mapping import Attributes, Components, Labels, Numbers
 from gmmtorch.mapping.codec.quantization import quantized, spatial_order
-from gmmtorch.mapping.components import Components
 
 
 def rotations(k: int, dim: int, generator: torch.Generator) -> Tensor:

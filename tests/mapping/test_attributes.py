@@ -16,22 +16,18 @@ from scipy.stats import multivariate_normal
 from torch import Tensor
 
 import gmmtorch as gt
+from gmmtorch import Components, Scan
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import read_tensors
+from gmmtorch.mapping import Attributes, BitWriter, Labels, Numbers, TiledMap, quantized, tile_files
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.attributes.answers import predictions
-from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
 from gmmtorch.mapping.codec import number_model
 from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
-from gmmtorch.mapping.codec.bitstream import BitWriter
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.merging import compact
-from gmmtorch.mapping.tiles.tile_files import tile_files
-from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.mixture import Cells, merge_components
 from gmmtorch.mixture.em.exact import quadratic_features
-from gmmtorch.scan import Scan, display_colours, linear_colours
+from gmmtorch.scan import display_colours, linear_colours
 
 
 def seeded(seed: int) -> torch.Generator:

@@ -17,14 +17,12 @@ from mapping.earlier_batches import EARLIER
 from mapping.map_cases import assert_same_components
 from mapping.random_components import around_a_sensor, drawn, random_components
 
+from gmmtorch import Components
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.kernels.codes import context_coding
+from gmmtorch.mapping import BitWriter, decode, encode, encode_quantized, quantize, quantized, spatial_order
 from gmmtorch.mapping.codec import context_model
-from gmmtorch.mapping.codec.bitstream import BitWriter
-from gmmtorch.mapping.codec.component_batch import decode, encode, encode_quantized
-from gmmtorch.mapping.codec.quantization import quantize, quantized, spatial_order
 from gmmtorch.mapping.codec.range_coder import RangeCoder
-from gmmtorch.mapping.components import Components
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

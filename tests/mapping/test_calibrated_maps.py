@@ -10,9 +10,7 @@ from torch import Tensor
 
 from gmmtorch.experiments.evaluation import queries
 from gmmtorch.experiments.evaluation.metrics import scores
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.tiles.tile_files import tile_files
-from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
+from gmmtorch.mapping import GaussianMap, TiledMap, merge, tile_files
 from gmmtorch.scan import Scan
 
 SIDE = 10.0

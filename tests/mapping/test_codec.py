@@ -14,17 +14,14 @@ from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import counts_add_up, drawn, random_components, rotations
 
+from gmmtorch import Components, WindowedRule
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import metrics, queries
+from gmmtorch.mapping import ORIGIN_STEP, decode, encode, learn_window, quantized, spatial_order
 from gmmtorch.mapping.codec import component_batch, lattice
-from gmmtorch.mapping.codec.component_batch import decode, encode
-from gmmtorch.mapping.codec.quantization import COUNT_ERROR, ORIGIN_STEP, quantized, spatial_order
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.rules import WindowedRule
-from gmmtorch.mapping.learning.windows import learn_window
-from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.forms.point import point_evidence
+from gmmtorch.mapping.codec.quantization import COUNT_ERROR
+from gmmtorch.occupancy import occupancy_probability, point_evidence
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 coarse = pytest.mark.parametrize("coarse", [False, True])

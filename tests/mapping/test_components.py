@@ -15,13 +15,8 @@ from occupancy.protocol_contract import dims, lattice, wall_scan
 from scipy.stats import multivariate_normal
 from torch import Tensor
 
-from gmmtorch.errors import GmmTorchError
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.novelty import summed
-from gmmtorch.mapping.query_options import METHODS
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch import Components, GaussianMap, GmmTorchError, VoxelGrid
+from gmmtorch.mapping import METHODS, quantized, summed
 
 PARTS = ("means", "covariances", "support", "origins")
 

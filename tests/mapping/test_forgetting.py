@@ -11,10 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gmmtorch import GaussianMap, IncrementalRule, Scan, WindowedRule
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
-from gmmtorch.scan import Scan
 from gmmtorch.simulation import World2D, laser_2d, simulate_scan
 from gmmtorch.team.sharing import Replica
 

@@ -17,12 +17,9 @@ from torch import Tensor
 
 from gmmtorch.datasets import load
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MemoryLimitError
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import TENSORS, Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
+from gmmtorch.mapping import Components, GaussianMap, IncrementalRule, NoveltyRule, WindowedRule, quantized
+from gmmtorch.mapping.components import TENSORS
+from gmmtorch.occupancy import OccupancyGrid, VoxelGrid
 from gmmtorch.scan import Scan
 
 BUFFERS = sorted(TENSORS)
@@ -105,9 +102,11 @@ def test_repr_is_true_before_and_after_the_window_is_learned():
 
 
 @pytest.mark.parametrize("learning", ["incremental", 3, IncrementalRule])
-def test_learning_that_is_no_rule_is_refused_at_construction(learning):
+def test_learning_that_is_no_rule_and_what_is_no_scan_are_refused(learning):
     with pytest.raises(InvalidArgumentError, match=r"^learning=.* give IncrementalRule\(\)"):
         GaussianMap(learning)
+    with pytest.raises(InvalidArgumentError, match=r"Tensor.*Scan"):
+        GaussianMap().insert(torch.zeros(3, 2))
 
 
 @pytest.mark.parametrize("method", ["point", "monte_carlo"])
@@ -221,11 +220,6 @@ def test_the_window_argument_sets_that_of_the_rule():
 
 
 # -- insert ----------------------------------------------------------------------------------------------
-
-
-def test_insert_refuses_what_is_no_scan():
-    with pytest.raises(InvalidArgumentError, match=r"Tensor.*Scan"):
-        GaussianMap().insert(torch.zeros(3, 2))
 
 
 def test_overwriting_inserted_arrays_does_not_change_the_map():

@@ -17,11 +17,8 @@ from mapping.test_tiles import SETTINGS, SIDE, contents, moved, recording, writt
 
 from gmmtorch.errors import DataError, InvalidArgumentError, MissingDataError, OutputError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import INDEX, Components, GaussianMap, TiledMap, merge, tile_files
 from gmmtorch.mapping.tiles import tiled_map
-from gmmtorch.mapping.tiles.tile_files import INDEX, tile_files
-from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
 from gmmtorch.scan import Scan
 
 RULE = replace(FINE, window=3, mean_origins=None)

@@ -11,17 +11,14 @@ from mapping.test_growing_tiles import around, street
 from occupancy.protocol_contract import shifted
 from torch import Tensor
 
+from gmmtorch.mapping import GaussianMap, IncrementalRule, TiledMap, WindowedRule
 from gmmtorch.mapping import query as map_query
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
 from gmmtorch.mapping.tiles import tiled_map
-from gmmtorch.mapping.tiles.tiled_map import TiledMap
 from gmmtorch.occupancy import point_evidence
 from gmmtorch.scan import Scan
 
 
-def test_a_million_hits_from_one_place_are_a_small_map():
-    generator = torch.Generator().manual_seed(0)
+def test_a_million_hits_from_one_place_are_a_small_map(generator):
     made, origin = GaussianMap(IncrementalRule(window=5)), torch.zeros(3, dtype=torch.float64)
     for _ in range(20):
         wall = 4 * torch.rand(50_000, 3, generator=generator, dtype=torch.float64) - 2

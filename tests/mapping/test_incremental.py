@@ -18,16 +18,12 @@ from torch import Tensor
 import gmmtorch
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.experiments.evaluation import metrics, queries
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
+from gmmtorch.mapping import METHODS, Components, GaussianMap, IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.mapping.learning.fitting import DepthFrame
 from gmmtorch.mapping.learning.merging import UNNUMBERED
 from gmmtorch.mapping.learning.novelty import entropy_reduction
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule
 from gmmtorch.mapping.learning.windows import absorb
-from gmmtorch.mapping.query_options import METHODS
-from gmmtorch.occupancy.evidence import occupancy_probability
-from gmmtorch.occupancy.forms.point import point_evidence
+from gmmtorch.occupancy import occupancy_probability, point_evidence
 from gmmtorch.pinhole import back_project
 from gmmtorch.scan import Scan
 

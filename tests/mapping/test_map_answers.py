@@ -21,17 +21,11 @@ from mapping.map_cases import (
 from occupancy.protocol_contract import RESOLUTION, SENSOR, WALL, dims, lattice, points, shifted, wall_scan
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.mapping import map_state
+from gmmtorch.mapping import METHODS, GaussianMap, Query, QueryOptions, map_state, quantized
 from gmmtorch.mapping import query as map_query
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query import Query, count_many, cutoff_of
-from gmmtorch.mapping.query_options import METHODS, QueryOptions
-from gmmtorch.occupancy import cone_index
-from gmmtorch.occupancy.calibrator import Calibration
-from gmmtorch.occupancy.cones import CUTOFF, Cones
+from gmmtorch.mapping.query import count_many, cutoff_of
+from gmmtorch.occupancy import CUTOFF, Calibration, Cones, VoxelGrid, cone_index
 from gmmtorch.occupancy.forms import point as point_form
-from gmmtorch.occupancy.grid import VoxelGrid
 
 methods = pytest.mark.parametrize("method", METHODS)
 
@@ -131,9 +125,8 @@ def test_all_methods_approximate_monte_carlo_occupancy(dim):
 
 @dims
 @pytest.mark.parametrize("learning", [None, FINE])
-def test_gradients_in_the_queries_equal_finite_differences(dim, learning):
+def test_gradients_in_the_queries_equal_finite_differences(dim, learning, generator):
     made = built(drive(2, dim), learning)
-    generator = torch.Generator().manual_seed(0)
     on_wall = points([WALL], dim) + 0.05 * torch.randn(20, dim, generator=generator, dtype=torch.float64)
     query = torch.cat([lattice(dim)[::17], on_wall]).requires_grad_()
     made.occupancy(query, 0.125, "point").sum().backward()
@@ -254,14 +247,15 @@ def test_a_map_asked_after_each_scan_answers_like_a_new_one(dim, method, codec, 
 
 @dims
 @pytest.mark.parametrize("few_pairs", [0, 1 << 19])
-def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(dim, few_pairs, monkeypatch):
+def test_blocks_answer_as_one_form_of_all_cones_however_the_components_change(
+    dim, few_pairs, monkeypatch, generator
+):
     for module in (point_form, cone_index):
         monkeypatch.setattr(module, "_FEW_PAIRS", few_pairs)
     monkeypatch.setattr(map_query, "_BLOCK", 20)
     every = built(corridor(9, dim), FINE).components()
     asked = torch.cat([lattice(dim), lattice(dim) + torch.tensor([4.0, 0, 0][:dim])])
     asked = torch.cat([asked, torch.full_like(asked[:1], torch.inf), 1e7 + asked[:1]])
-    generator = torch.Generator().manual_seed(0)
     options = QueryOptions(cutoff=4.0)
     answers = Query([every.selected(torch.arange(10))], options)
     for step in range(12):

@@ -24,15 +24,11 @@ from mapping.map_cases import (
 from occupancy.protocol_contract import dims, lattice, quarter_turn, shifted, wall_scan
 from torch import Tensor
 
+from gmmtorch import Components, GaussianMap, IncrementalRule, Scan, WindowedRule
 from gmmtorch.datasets import Dataset, Ranges, load
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
-from gmmtorch.mapping.map_builder import MapBuilder, WindowMotions
-from gmmtorch.scan import Scan
+from gmmtorch.mapping import MapBuilder, WindowMotions, quantized
 
 RUN = {"seed": 0}
 N = 11

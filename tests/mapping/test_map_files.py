@@ -21,12 +21,10 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mapping import Components, GaussianMap, IncrementalRule, QueryOptions, WindowedRule
 from gmmtorch.mapping.codec import component_batch as storage
 from gmmtorch.mapping.codec.quantization import numbered
-from gmmtorch.mapping.components import UNNUMBERED, Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.learning.rules import IncrementalRule, WindowedRule
-from gmmtorch.mapping.query_options import QueryOptions
+from gmmtorch.mapping.components import UNNUMBERED
 from gmmtorch.occupancy.calibrator import Calibration
 from gmmtorch.scan import Scan
 

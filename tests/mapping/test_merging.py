@@ -9,14 +9,12 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from mapping.map_cases import merged, sightings
 from mapping.random_components import counts_add_up, estimated_bytes, normal_components, total_moments
 from scipy.stats import chi2
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components, count_explained
 from gmmtorch.mapping.learning.merging import UNNUMBERED, compact, compact_to_bytes, limit_origins
-from gmmtorch.mapping.learning.novelty import count_explained
 
 
 def pair(offset: float, deviation: float = 0.1, flags: tuple[bool, bool] = (False, False)) -> Components:
@@ -65,18 +63,6 @@ def test_unmerged_components_keep_every_bit_and_their_id():
         old = int(left.ids[row, 1])
         for name in ("means", "covariances", "support", "max_range"):
             assert torch.equal(getattr(left, name)[row], getattr(near, name)[old])
-
-
-def test_a_merged_component_has_the_origins_of_both():
-    given_ = normal_components(6, 2, 1)
-    labels = [0, 1, 0, 2, 1, 0]
-    expected: list[dict[tuple[float, ...], float]] = [{} for _ in range(3)]
-    for label, seen in zip(labels, sightings(given_), strict=True):
-        for place, count in seen.items():
-            expected[label][place] = expected[label].get(place, 0.0) + count
-    found = merged(given_, torch.tensor(labels))
-    for got, wanted in zip(sightings(found), expected, strict=True):
-        assert got == pytest.approx(wanted)
 
 
 def test_surface_components_never_merge_with_no_return_components():
@@ -171,13 +157,6 @@ def test_limit_origins_equals_a_greedy_loop(k, dim, seed, limit, mean):
     )
 
 
-def test_kept_origins_keep_the_proportions_of_their_counts():
-    given_ = normal_components(8, 2, 3, n_origins=6)
-    for kept, before in zip(sightings(limit_origins(given_, 2)), sightings(given_), strict=True):
-        ratios = [count / before[place] for place, count in kept.items()]
-        assert max(ratios) == pytest.approx(min(ratios), rel=1e-9)
-
-
 # -- bytes ----------------------------------------------------------------------------------------
 
 
@@ -262,18 +241,6 @@ def test_association_counts_equal_a_loop(dim, seed, distance, limit, max_range, 
     assert counts_add_up(found[0])
     gained = float(found[0].support.sum() - components.support.sum())
     assert math.isclose(gained, sum(explained), abs_tol=1e-6)
-
-
-def test_association_keeps_moments_and_adds_beam_weights():
-    components = normal_components(4, 3, 0)
-    at_mean = components.means[:1]  # where the thesis's shares divide by zero
-    found = count_explained(components, at_mean, components.origins[0], 100.0, weight=16.0)
-    assert found[1].tolist() == [True]
-    assert math.isclose(float(found[0].support.sum() - components.support.sum()), 16.0)
-    assert float(found[0].support[0] - components.support[0]) > 15.9
-    assert torch.equal(found[0].means, components.means)
-    assert torch.equal(found[0].covariances, components.covariances)
-    assert torch.equal(found[0].ids, components.ids)
 
 
 def test_without_components_or_points_nothing_is_explained():

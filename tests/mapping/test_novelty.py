@@ -9,18 +9,13 @@ import torch
 from mapping.map_cases import absorbed
 from mapping.random_components import normal_components
 from occupancy.exact_dda import voxels_left
-from occupancy.protocol_contract import dims, empty_scan, open_scan, wall_scan
+from occupancy.protocol_contract import dims, empty_scan, wall_scan
 from occupancy.test_rolling_window import at, cells_of, new_window, random_evidence
 
+from gmmtorch import Components, IncrementalRule, NoveltyRule, Scan
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import beam_novelty, entropy_reduction, novel_beams
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule
-from gmmtorch.occupancy.forms.point import point_evidence
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
-from gmmtorch.scan import Scan
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence, point_evidence
 
 RULE = NoveltyRule(resolution=0.125, threshold=0.5)
 LEARNING = IncrementalRule(noise=0.01, length=0.5, cell=0.05)
@@ -66,49 +61,11 @@ def test_entropy_reduction_equals_an_exact_walk(dim, seed):
 
 
 @dims
-def test_beams_through_learned_space_are_not_novel(dim):
-    scans = [wall_scan(dim, seed) for seed in range(3)]
-    learned = absorbed(Components.empty(dim), scans, LEARNING)
-    again = wall_scan(dim, 9)
-    assert float(novel_beams(learned, again, RULE).double().mean()) < 0.25
-    elsewhere = again.transformed(_turn(dim))
-    assert bool(novel_beams(learned, elsewhere, RULE).all())
-
-
-def _turn(dim: int) -> torch.Tensor:
-    """Half a turn about the vertical through the world's origin: the wall is now behind."""
-    matrix = torch.eye(dim + 1, dtype=torch.float64)
-    matrix[0, 0] = matrix[1, 1] = -1
-    return matrix
-
-
-@dims
 def test_every_beam_is_novel_to_an_empty_map(dim):
     assert bool(novel_beams(Components.empty(dim), wall_scan(dim), RULE).all())
     assert novel_beams(Components.empty(dim), empty_scan(dim), RULE).shape == (0,)
     known = absorbed(Components.empty(dim), [wall_scan(dim)], LEARNING)
     assert novel_beams(known, empty_scan(dim), RULE).shape == (0,)
-
-
-def test_one_unobserved_cell_makes_a_beam_novel():
-    known = absorbed(Components.empty(2), [wall_scan(2, seed) for seed in range(3)], LEARNING)
-    inside = wall_scan(2, 5).select(torch.arange(241) == 120)
-    never = NoveltyRule(resolution=0.125, threshold=1e6)
-    assert novel_beams(known, inside, never).tolist() == [False]
-    through = Scan(inside.points + torch.tensor([0.5, 0.0], dtype=torch.float64), inside.origin)
-    assert novel_beams(known, through, never).tolist() == [True]
-    unasked = NoveltyRule(resolution=0.125, threshold=1e6, observed=0.0)
-    assert novel_beams(known, through, unasked).tolist() == [False]
-
-
-@dims
-def test_no_return_beams_reduce_the_entropy_of_free_space(dim):
-    open_ = open_scan(dim)
-    learned = absorbed(Components.empty(dim), [open_, open_, open_], LEARNING)
-    assert bool(learned.max_range.all())
-    bits, _ = entropy_reduction(learned, open_, RULE)
-    assert bool((bits > 0).all())
-    assert float(novel_beams(learned, open_, RULE).double().mean()) < 0.25
 
 
 def test_novelty_is_the_same_far_from_the_world_origin():
@@ -191,15 +148,6 @@ def test_beam_novelty_equals_a_cell_by_cell_walk(origin, spread):
         assert 0 < sum(new) < 60
 
 
-@pytest.mark.parametrize("short", [0.2, 2.0, 1e6])
-@pytest.mark.parametrize(("origin", "spread"), [(INSIDE, 0.5), (INSIDE, 4.0), (OUTSIDE, 5.0)])
-def test_a_hit_beam_frees_no_cells_within_short_of_its_end(short, origin, spread):
-    window = window_with(random_evidence(13_700, 5))
-    place = torch.tensor(origin, dtype=torch.float64) + 0.005
-    ends, is_hit = random_beams(60, 7, spread)
-    check(window, place, ends, is_hit, NoveltyRule(observed=3.0, prior=0.25), short=short)
-
-
 @pytest.mark.parametrize("corner", [(-3, -5, -2), (0, -40, -4), (-90, -90, -90), (30, 0, 0)])
 def test_cells_outside_the_given_box_have_no_novelty(corner):
     low = torch.tensor(corner)
@@ -213,20 +161,6 @@ def test_cells_outside_the_given_box_have_no_novelty(corner):
     known.add(CellEvidence(outside, many, 0 * many))
     ends, is_hit = random_beams(80, 3, 1.0)
     check(window, CENTER, ends, is_hit, NoveltyRule(observed=3.0), known, within=within)
-
-
-def test_observed_space_is_not_novel():
-    window = window_with()
-    ends = torch.tensor([[1.1, 0.1, 0.2], [0.3, -1.4, 0.1]], dtype=torch.float64)
-    beams = (at(0, 0, 0), ends, torch.tensor([True, False]))
-    bits, unobserved = beam_novelty(window, *beams, NoveltyRule())
-    assert bool((bits > 0.3).all())
-    assert unobserved.tolist() == [True, True]
-    evidence = cast_evidence(*beams, 0.25, window.box)
-    window.add(CellEvidence(evidence.cells, 60 * evidence.hits, 60 * evidence.misses))
-    bits, unobserved = beam_novelty(window, *beams, NoveltyRule())
-    assert bool((bits.abs() < 0.05).all())
-    assert unobserved.tolist() == [False, False]
 
 
 def test_a_hit_in_a_free_cell_is_novel_until_the_map_has_hits_there():

@@ -13,17 +13,13 @@ from hypothesis import strategies as st
 from invalid_values import each_value
 from torch import Tensor
 
+from gmmtorch import Components, GaussianMap, IncrementalRule, NoveltyRule, Scan, WindowedRule
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.mapping.learning.fitting import DepthFrame, fit_window
 from gmmtorch.mapping.learning.merging import all_origins
-from gmmtorch.mapping.learning.rules import IncrementalRule, NoveltyRule, WindowedRule, read_rule, rule_facts
+from gmmtorch.mapping.learning.rules import read_rule, rule_facts
 from gmmtorch.mapping.learning.windows import surface_fit
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.estimators.sensor_model import measured_sensor
-from gmmtorch.mixture.pruning import density_share
-from gmmtorch.scan import Scan
+from gmmtorch.mixture import Parameters, density_share, measured_sensor
 
 MIXTURE = {
     "prune": ["weight"],

@@ -11,12 +11,7 @@ import torch
 from mapping.random_components import random_components
 
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.mapping.codec.thesis_message import (
-    decode_thesis,
-    decode_thesis_updates,
-    encode_thesis,
-    encode_thesis_updates,
-)
+from gmmtorch.mapping import decode_thesis, decode_thesis_updates, encode_thesis, encode_thesis_updates
 
 dims = pytest.mark.parametrize("dim", [2, 3])
 

@@ -12,15 +12,12 @@ from hypothesis import strategies as st
 from mapping.map_cases import assert_same_components
 from mapping.random_components import random_components
 
+from gmmtorch import Components, GaussianMap
 from gmmtorch.errors import DataError, InvalidArgumentError, MemoryLimitError, MissingDataError
 from gmmtorch.files import pack_tensors, read_tensors
+from gmmtorch.mapping import INDEX, QueryOptions, TiledMap, merge, quantized, tile_files
 from gmmtorch.mapping.codec.component_batch import MapSettings
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.mapping.query_options import QueryOptions
-from gmmtorch.mapping.tiles.tile_files import INDEX, canonical, tile_files
-from gmmtorch.mapping.tiles.tiled_map import TiledMap, merge
+from gmmtorch.mapping.tiles.tile_files import canonical
 from gmmtorch.occupancy.calibrator import Calibration
 
 SIDE = 10.0

@@ -18,8 +18,7 @@ from sklearn.base import clone
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mixture.density import NotFittedError
-from gmmtorch.mixture.estimator import MixtureEstimator
+from gmmtorch.mixture import MixtureEstimator, NotFittedError
 
 BAD_PARAMETERS: dict[str, tuple[Any, ...]] = {
     "n_components": (0, -1, 1.5, "many"),

@@ -14,10 +14,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from gmmtorch.files import pack_tensors, read_tensors
-from gmmtorch.mixture import GaussianMixture, MixtureEstimator
+from gmmtorch.mixture import GaussianMixture, MixtureEstimator, Parameters, Rows
 from gmmtorch.mixture.em import by_type
-from gmmtorch.mixture.em.exact import Parameters, quadratic_features
-from gmmtorch.mixture.em.truncated import Rows
+from gmmtorch.mixture.em.exact import quadratic_features
 
 
 def cloud(n: int, dim: int, seed: int = 0) -> Tensor:

@@ -10,19 +10,23 @@ import pytest
 import scipy.special
 import sklearn.mixture
 import torch
+from kernels.twins import Largest
 from mixture.mixture_cases import random_parameters, scipy_log_joint
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import GmmTorchError, NumericalError
-from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
+from gmmtorch.mixture import (
+    INITIALIZATIONS,
+    GaussianMixture,
+    Parameters,
+    VariationalGaussianMixture,
+    fit_stream,
+    initialize,
+)
 from gmmtorch.mixture import HierarchicalGaussianMixture as Tree
 from gmmtorch.mixture.em import by_type, loop
-from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, constrain, expand, type_shape
-from gmmtorch.mixture.em.initialization import INITIALIZATIONS, initialize
+from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, constrain, expand, type_shape
 from gmmtorch.mixture.reduction import merge_pairs
-from gmmtorch.mixture.streaming import fit_stream
 
 types = pytest.mark.parametrize("kind", COVARIANCE_TYPES)
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -159,19 +163,6 @@ def test_the_density_and_the_responsibilities_have_gradients(kind, dim):
         return mixture(points), mixture.predict_proba(points)
 
     assert torch.autograd.gradcheck(ask, (points, means.clone().requires_grad_()))
-
-
-class Largest(TorchDispatchMode):
-    """The entries of the largest tensor that an operation makes."""
-
-    entries = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        result = func(*args, **(kwargs or {}))
-        for leaf in tree_leaves(result):
-            if isinstance(leaf, torch.Tensor) and not leaf._is_view():
-                self.entries = max(self.entries, leaf.numel())
-        return result
 
 
 @types

@@ -18,8 +18,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture
-from gmmtorch.mixture.em.exact import Parameters
+from gmmtorch.mixture import DeconvolvedGaussianMixture, GaussianMixture, Parameters
 from gmmtorch.mixture.estimators import deconvolved
 from gmmtorch.mixture.estimators.deconvolved import (
     Block,

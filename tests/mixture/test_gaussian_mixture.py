@@ -56,9 +56,6 @@ def test_integers_lists_and_half_precision_are_accepted():
     assert torch.equal(gmm.score_samples(far.half()), gmm.score_samples(far.double()))  # below −65,504
 
 
-# -- frames ----------------------------------------------------------------------------------------
-
-
 # -- starts ----------------------------------------------------------------------------------------
 
 

@@ -20,21 +20,20 @@ from sklearn.datasets import load_digits, load_iris
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em import initialization
-from gmmtorch.mixture.em import kmeans as module
-from gmmtorch.mixture.em.exact import Parameters, quadratic_features
-from gmmtorch.mixture.em.initialization import (
+from gmmtorch.mixture import (
     INITIALIZATIONS,
-    distinct,
-    flat_pieces,
+    GaussianMixture,
+    Parameters,
     initialize,
-    moments_of,
-    replicated,
+    least_support,
+    pool_into_cells,
     surface_pieces,
 )
+from gmmtorch.mixture.em import initialization
+from gmmtorch.mixture.em import kmeans as module
+from gmmtorch.mixture.em.exact import quadratic_features
+from gmmtorch.mixture.em.initialization import distinct, flat_pieces, moments_of, replicated
 from gmmtorch.mixture.em.kmeans import kmeans, spread_out
-from gmmtorch.mixture.em.partition import least_support, pool_into_cells
 
 METHODS = sorted(INITIALIZATIONS)
 SEEDED = [method for method in METHODS if method != "flat_pieces"]
@@ -419,16 +418,17 @@ def test_warm_start_and_partial_fit_keep_the_number():
     assert len(batches.means_) == count(points)
 
 
-@pytest.mark.parametrize("name", ["weights_init", "means_init", "precisions_init"])
-def test_given_start_is_rejected(name):
-    with pytest.raises(InvalidArgumentError, match=f"{name}.*n_components=None"):
-        GaussianMixture(None, **{name: np.ones(1)}).fit(room(10))
-
-
-@pytest.mark.parametrize("noise", [0, -1.0, math.nan, math.inf, "low", None])
-def test_invalid_noise_is_rejected(noise):
-    with pytest.raises(InvalidArgumentError, match=r"^noise"):
-        GaussianMixture(None, noise=noise).fit(room(10))
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        *(({name: np.ones(1)}, f"{name}.*n_components=None") for name in
+          ("weights_init", "means_init", "precisions_init")),
+        *(({"noise": noise}, r"^noise") for noise in (0, -1.0, math.nan, math.inf, "low", None)),
+    ],
+)  # fmt: skip
+def test_a_given_start_and_invalid_noise_are_rejected(options, message):
+    with pytest.raises(InvalidArgumentError, match=message):
+        GaussianMixture(None, **options).fit(room(10))
 
 
 # -- k-means ---------------------------------------------------------------------------------------

@@ -79,8 +79,7 @@ def test_equal_points_are_one_piece(n):
 
 
 @pytest.mark.parametrize(("n_strays", "distance"), [(9, 200.0), (9, 1000.0), (1, 500.0)])
-def test_few_far_returns_do_not_prevent_the_partition(n_strays, distance):
-    generator = torch.Generator().manual_seed(0)
+def test_few_far_returns_do_not_prevent_the_partition(n_strays, distance, generator):
     room = torch.rand(2000, 3, generator=generator, dtype=torch.float64) * torch.tensor([6.0, 5.0, 2.5])
     strays = torch.randn(n_strays, 3, generator=generator, dtype=torch.float64) + distance
     rule = FlatnessRule(min_weight=20, min_weight_thick=20)

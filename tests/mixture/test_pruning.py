@@ -16,8 +16,7 @@ from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.partition import FlatnessRule, partition
 from gmmtorch.mixture.estimators.sensor_model import DepthCameraModel, LaserModel, LidarModel, SensorModel
 from gmmtorch.mixture.pruning import expected_density, support_density
-from gmmtorch.simulation import RangeSensor, laser_2d, simulate_scan, spinning_lidar
-from gmmtorch.simulation.sensors import depth_camera
+from gmmtorch.simulation import RangeSensor, depth_camera, laser_2d, simulate_scan, spinning_lidar
 
 
 def tensor(*rows: object) -> Tensor:
@@ -62,10 +61,9 @@ def test_expected_density_with_counts_by_hand():
         assert float(found) == pytest.approx(expected)
 
 
-def test_the_density_of_a_large_component_is_that_of_its_mean_area_per_beam():
+def test_the_density_of_a_large_component_is_that_of_its_mean_area_per_beam(generator):
     camera = DepthCameraModel(pixel_angle=0.01, max_incidence=0.0)
     means, covariances = tensor([0.0, 0.0, 1.0]), torch.diag(tensor(0.5, 2.0, 1e-6))[None]
-    generator = torch.Generator().manual_seed(0)
     draws = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
     points = means + draws @ covariances[0].sqrt()
     area = camera.point_density(points.norm(dim=1)).reciprocal().mean()

@@ -20,16 +20,13 @@ from torch import Tensor
 
 from gmmtorch.errors import NumericalError
 from gmmtorch.kernels import kernels
-from gmmtorch.mixture import GaussianMixture
+from gmmtorch.mixture import GaussianMixture, Parameters, RiemannianGaussianMixture, Rows
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop
 from gmmtorch.mixture.em.by_type import Factors
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.truncated import Rows
 from gmmtorch.mixture.estimators.riemannian import (
     Iterate,
     Likelihood,
-    RiemannianGaussianMixture,
     ascend,
     pack_tangent,
     quasi_newton,

@@ -21,8 +21,7 @@ from gmmtorch.mixture.estimators.sensor_model import (
     estimate_normals,
     measured_sensor,
 )
-from gmmtorch.simulation import laser_2d, simulate_scan, spinning_lidar
-from gmmtorch.simulation.sensors import depth_camera
+from gmmtorch.simulation import depth_camera, laser_2d, simulate_scan, spinning_lidar
 
 MODELS: list[tuple[SensorModel, int]] = [(DepthCameraModel(), 3), (LidarModel(), 3), (LaserModel(), 2)]
 models = pytest.mark.parametrize(("model", "dim"), MODELS, ids=["camera", "lidar", "laser"])

@@ -18,14 +18,11 @@ from scipy.stats import norm
 from torch import Tensor
 
 from gmmtorch.errors import NumericalError
-from gmmtorch.mixture import GaussianMixture
-from gmmtorch.mixture.em.exact import Parameters
-from gmmtorch.mixture.em.initialization import initialize
+from gmmtorch.mixture import GaussianMixture, Parameters, SlicedWassersteinGaussianMixture, initialize
 from gmmtorch.mixture.estimators import sliced_wasserstein as lines
 from gmmtorch.mixture.estimators.sliced_wasserstein import (
     LEVELS,
     Shape,
-    SlicedWassersteinGaussianMixture,
     Slices,
     differentiate,
     mixture_quantiles,

@@ -16,21 +16,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from gmmtorch import GaussianMixture, fit_stream
 from gmmtorch.datasets.point_files.point_chunks import PointChunks, in_memory, open_points
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, LostProcessError, Processes, is_launched, joined
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, Parameters, expand, type_shape
-from gmmtorch.mixture.gaussian_mixture import GaussianMixture
-from gmmtorch.mixture.streaming import (
-    Accumulate,
-    Checkpoint,
-    State,
-    fit_stream,
-    read_state,
-    score_stream,
-    write_state,
-)
+from gmmtorch.mixture.streaming import Accumulate, Checkpoint, State, read_state, score_stream, write_state
 
 pytestmark = pytest.mark.filterwarnings("ignore:EM did not converge")
 

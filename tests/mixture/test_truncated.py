@@ -24,17 +24,15 @@ from mixture.mixture_cases import (
 from scipy.special import logsumexp
 from torch import Tensor
 
+from gmmtorch import GaussianMixture, fit_stream
 from gmmtorch.datasets.point_files.point_chunks import in_memory
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import chunks
-from gmmtorch.mixture import GaussianMixture, gaussian_mixture
+from gmmtorch.mixture import Checkpoint, Parameters, Processes, Rows, gaussian_mixture
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em import loop, truncated
-from gmmtorch.mixture.em.distributed import Processes
-from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.mixture.em.initialization import flat_pieces
 from gmmtorch.mixture.em.truncated import (
-    Rows,
     Settings,
     choose_candidates,
     fit_truncated,
@@ -42,7 +40,6 @@ from gmmtorch.mixture.em.truncated import (
     nearest,
     truncated_expectation,
 )
-from gmmtorch.mixture.streaming import Checkpoint, fit_stream
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -19,15 +19,9 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError, NumericalError
 from gmmtorch.kernels import kernels
-from gmmtorch.mixture import GaussianMixture, VariationalGaussianMixture
-from gmmtorch.mixture.density import NotFittedError
+from gmmtorch.mixture import GaussianMixture, NotFittedError, VariationalGaussianMixture, initialize
 from gmmtorch.mixture.em import by_type
-from gmmtorch.mixture.em.initialization import initialize
-from gmmtorch.mixture.em.variational_bayes import (
-    expected_log_weights,
-    expected_weights,
-    unbiased_covariance,
-)
+from gmmtorch.mixture.em.variational_bayes import expected_log_weights, expected_weights, unbiased_covariance
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from gmmtorch.kernels import pair_evidence
 from gmmtorch.linalg import safe_cholesky
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.point import PointEvidence, PointForm
+from gmmtorch.occupancy import Cones, PointEvidence, PointForm
 
 
 def uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:

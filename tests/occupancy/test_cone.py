@@ -16,11 +16,10 @@ from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from gmmtorch.experiments.studies.angular_reference import angular_evidence
-from gmmtorch.occupancy.cones import Cones
+from gmmtorch.occupancy import Cones, cone_evidence
 from gmmtorch.occupancy.forms.cone import (
     approximate_erf,
     approximate_probability,
-    cone_evidence,
     facing,
     image,
     outline,

@@ -22,26 +22,20 @@ from occupancy.cone_cases import (
     uniform,
 )
 
+from gmmtorch import VoxelGrid
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy import cone_index
+from gmmtorch.occupancy import CUTOFF, ConeIndex, Cones, PointForm, cells_in_chunks, cone_bounds, cone_index
 from gmmtorch.occupancy import cones as culling
-from gmmtorch.occupancy.cone_index import ConeIndex
 from gmmtorch.occupancy.cones import (
-    CUTOFF,
-    Cones,
     WhitenedCones,
     ball_rows,
     candidate_pairs,
-    cone_bounds,
     cross,
     face_rows,
     outside_ball,
     outside_cone,
 )
 from gmmtorch.occupancy.forms import point as point_form
-from gmmtorch.occupancy.forms.point import PointForm
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.cells import cells_in_chunks
 
 
 def places_on_rays(cones: Cones, n: int, cutoff: float, seed: int) -> tuple[torch.Tensor, torch.Tensor]:

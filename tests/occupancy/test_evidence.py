@@ -65,20 +65,25 @@ def test_occupancy_probability_equals_equation_3_9(hits, misses, prior):
 
 @pytest.mark.parametrize("prior", [0, 1e-300, 0.1, 1 / 3, 1, 7.7])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_occupancy_without_evidence_is_exactly_half(prior, dtype):
+def test_occupancy_is_exactly_half_without_evidence_and_the_share_of_hits_without_a_prior(prior, dtype):
     zero = torch.zeros(3, dtype=dtype)
     assert occupancy_probability(zero, zero, prior).tolist() == [0.5] * 3
-
-
-def test_occupancy_with_prior_zero_is_the_share_of_hits():
     theta = occupancy_probability(torch.tensor([3.0, 0.0, 2.0]), torch.tensor([1.0, 5.0, 0.0]), 0)
     assert theta.tolist() == [0.75, 0.0, 1.0]
 
 
-@pytest.mark.parametrize("prior", [-1, float("nan"), float("inf")])
-def test_invalid_priors_are_refused(prior):
-    with pytest.raises(InvalidArgumentError, match="prior"):
-        occupancy_probability(torch.ones(1), torch.ones(1), prior)
+@pytest.mark.parametrize(
+    ("name", "make", "values"),
+    [
+        ("prior", lambda x: occupancy_probability(torch.ones(1), torch.ones(1), x), (-1, math.nan, math.inf)),
+        ("variance_threshold", lambda x: classify(torch.tensor([0.5]), x), (0, -0.1, 0.26, math.nan)),
+        ("free_thresh=", lambda x: Thresholds(*x), ((0.7, 0.6), (-0.1, 0.5), (0.1, 1.1), (math.nan, 0.5))),
+    ],
+)
+def test_invalid_priors_and_thresholds_are_refused(name, make, values):
+    for value in values:
+        with pytest.raises(InvalidArgumentError, match=name):
+            make(value)
 
 
 @pytest.mark.parametrize("theta", [0.0, 1e-12, 0.1, 0.5, 0.77, 1.0])
@@ -88,9 +93,8 @@ def test_entropy_equals_scipys_bernoulli(theta):
     assert float(bernoulli_entropy(value)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_methods_of_evidence_equal_the_functions():
+def test_methods_of_evidence_equal_the_functions(generator):
     grid = GRIDS[2]
-    generator = torch.Generator().manual_seed(0)
     evidence = Evidence(grid, *(5 * torch.rand(2, *grid.shape, generator=generator, dtype=torch.float64)))
     theta = (evidence.hits + 2) / (evidence.hits + evidence.misses + 4)
     torch.testing.assert_close(evidence.probability(2), theta)
@@ -116,12 +120,6 @@ def test_without_a_dead_band_only_a_half_is_unknown():
     theta = torch.tensor([0.0, 0.4999, 0.5, 0.5001, 1.0])
     assert classify(theta, 0.25).tolist() == [0, 0, -1, 1, 1]
     assert classify(theta, 0.25).dtype == torch.int8
-
-
-@pytest.mark.parametrize("threshold", [0, -0.1, 0.26, float("nan")])
-def test_invalid_variance_thresholds_are_refused(threshold):
-    with pytest.raises(InvalidArgumentError, match="variance_threshold"):
-        classify(torch.tensor([0.5]), threshold)
 
 
 # -- counting ------------------------------------------------------------------------------------------
@@ -155,12 +153,6 @@ def test_lookup_reads_the_cell_and_is_half_outside():
 def test_thresholds_classify_free_unknown_and_occupied():
     theta = torch.tensor([0.0, 0.196, 0.5, 0.65, 0.651, 1.0], dtype=torch.float64)
     assert Thresholds().classify(theta).tolist() == [0, -1, -1, -1, 1, 1]
-
-
-@pytest.mark.parametrize(("free", "occupied"), [(0.7, 0.6), (-0.1, 0.5), (0.1, 1.1), (math.nan, 0.5)])
-def test_thresholds_reject_invalid_values(free, occupied):
-    with pytest.raises(InvalidArgumentError, match="free_thresh="):
-        Thresholds(free, occupied)
 
 
 # -- VoxelGrid: indices, centres, covering a box, and bad input ------------------------------------------

@@ -503,8 +503,7 @@ def test_box_mass_is_exact_from_1e_6_to_1e6_component_sizes(dim, ratio):
     assert got == pytest.approx(expected, rel=1e-3, abs=1e-30)
 
 
-def test_masses_of_a_partition_sum_to_one_and_are_not_negative():
-    generator = torch.Generator().manual_seed(0)
+def test_masses_of_a_partition_sum_to_one_and_are_not_negative(generator):
     covariance = random_covariances(generator, torch.tensor([[0.002, 0.3, 0.4]], dtype=torch.float64))
     steps = torch.arange(-12, 12).double() * 0.2
     low = torch.cartesian_prod(steps, steps, steps)

@@ -8,13 +8,8 @@ import pytest
 import torch
 from occupancy.cone_cases import random_cones
 
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.cone import cone_evidence
-from gmmtorch.occupancy.forms.flux import box_flux, flux_evidence
-from gmmtorch.occupancy.forms.monte_carlo import sample_rays
-from gmmtorch.occupancy.forms.point import PointForm
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch import Evidence, VoxelGrid
+from gmmtorch.occupancy import Cones, PointForm, box_flux, cone_evidence, flux_evidence, sample_rays
 
 SIZE = 0.5
 Hits = Misses = torch.Tensor

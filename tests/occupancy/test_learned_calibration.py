@@ -15,10 +15,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.occupancy import Calibration, Calibrator, Evidence, Prediction, VoxelGrid, probability
 from gmmtorch.occupancy import calibrator as module
-from gmmtorch.occupancy.calibrator import Calibration, Calibrator, Prediction
-from gmmtorch.occupancy.evidence import Evidence, probability
-from gmmtorch.occupancy.grid import VoxelGrid
 
 SIDES = (0.02, 0.1, 0.4)
 counts = st.floats(0, 1e9)

@@ -11,10 +11,8 @@ from occupancy.cone_cases import joined, one_cone
 from scipy.stats import chi2, multivariate_normal
 
 from gmmtorch.errors import InvalidArgumentError, NumericalError
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.forms.monte_carlo import SAMPLINGS, allocate_samples, sample_rays
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy import Cones, Evidence, VoxelGrid, sample_rays
+from gmmtorch.occupancy.forms.monte_carlo import SAMPLINGS, allocate_samples
 
 MEAN_2D, COVARIANCE_2D = np.array([3.1, 1.3]), np.array([[0.12, 0.05], [0.05, 0.09]])
 SENSOR_2D = np.array([0.37, 0.21])

@@ -10,9 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence, sum_evidence
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.rolling_window import RollingWindow
+from gmmtorch.occupancy import Box, CellEvidence, RollingWindow, cast_evidence, sum_evidence
 
 SHAPE = (12, 16, 10)
 EVERYTHING = Box(torch.tensor([-4096] * 3), torch.tensor([4096] * 3))
@@ -147,18 +145,7 @@ def test_a_box_around_a_point_is_part_of_the_window(x, y, z, step, seed):
 # -- errors -------------------------------------------------------------------------------------------
 
 
-def test_boxes_outside_the_window_are_refused():
-    window = new_window()
-    window.center_on(at(0, 0, 0))
-    box = window.box
-    for wrong in (Box(box.low, box.high + 1), Box(box.low - 1, box.high)):
-        with pytest.raises(InvalidArgumentError, match="is not within the window"):
-            window.evidence(wrong)
-    with pytest.raises(InvalidArgumentError, match="is more than the window's"):
-        window.around(at(0, 0, 0), (12, 99, 7))
-
-
-def test_an_unplaced_window_is_refused():
+def test_an_unplaced_window_and_boxes_outside_it_are_refused():
     window = new_window()
     with pytest.raises(InvalidArgumentError, match="call center_on"):
         window.add(random_evidence(5, 0))
@@ -166,6 +153,13 @@ def test_an_unplaced_window_is_refused():
         window.evidence()
     with pytest.raises(InvalidArgumentError, match="position must be finite"):
         window.center_on(torch.tensor([0.0, float("nan"), 0.0]))
+    window.center_on(at(0, 0, 0))
+    box = window.box
+    for wrong in (Box(box.low, box.high + 1), Box(box.low - 1, box.high)):
+        with pytest.raises(InvalidArgumentError, match="is not within the window"):
+            window.evidence(wrong)
+    with pytest.raises(InvalidArgumentError, match="is more than the window's"):
+        window.around(at(0, 0, 0), (12, 99, 7))
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,8 @@ from occupancy.exact_dda import voxels_crossed, voxels_left
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.grid import BYTES_PER_CELL, VoxelGrid
-from gmmtorch.occupancy.voxels.cells import Box, CellEvidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import Box, CellEvidence, Evidence, SparseEvidence, VoxelGrid
+from gmmtorch.occupancy.grid import BYTES_PER_CELL
 
 RESOLUTION = 0.125
 Cell = tuple[int, ...]
@@ -232,19 +230,15 @@ def test_utm_coordinates_work_at_resolutions_that_are_no_binary_fraction(offset)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_unreachable_points_are_unknown(dim):
+def test_unreachable_points_are_unknown_and_an_empty_store_is_unknown_everywhere(dim):
     store = counted(*random_rays(50, dim))
     values = torch.tensor([math.nan, math.inf, -math.inf, 1e12, -1e12, 1e300], dtype=torch.float64)
     points = torch.zeros(len(values), dim, dtype=torch.float64)
     points[:, dim - 1] = values
     assert store.lookup(points).tolist() == [0.5] * len(values)
-
-
-def test_an_empty_store_is_unknown_everywhere():
-    store = SparseEvidence(RESOLUTION, 3)
-    store.add_rays(torch.empty(0, 3), torch.empty(0, 3))
-    assert store.lookup(torch.zeros(4, 3)).tolist() == [0.5] * 4
-    assert store.n_blocks == len(store.cells().cells) == 0
+    empty = counted(torch.empty(0, dim), torch.empty(0, dim))
+    assert empty.lookup(torch.zeros(4, dim)).tolist() == [0.5] * 4
+    assert empty.n_blocks == len(empty.cells().cells) == 0
 
 
 def test_rays_too_far_from_the_first_are_refused():

@@ -16,10 +16,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 from tensorboard.util.tensor_util import make_ndarray
 
 from gmmtorch.errors import OutputError
-from gmmtorch.report import tensorboard_writer
-from gmmtorch.report.accuracy_figures import roc_figure
-from gmmtorch.report.style import picture
-from gmmtorch.report.tensorboard_writer import Board
+from gmmtorch.report import Board, picture, roc_figure, tensorboard_writer
 
 
 def tensor(events: EventAccumulator, tag: str) -> np.ndarray:

@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gmmtorch.experiments.report.fit_study_figures import (
-    component_count_figures,
-    initialization_figures,
-    sensor_model_figures,
-)
+from gmmtorch.experiments.report import component_count_figures, initialization_figures, sensor_model_figures
 from gmmtorch.report.accuracy_figures import comparison_figure
 
 

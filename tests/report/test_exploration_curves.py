@@ -12,15 +12,8 @@ from shown import texts
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.style import PALETTE, LineEnd, label_ends, new_figure
 from gmmtorch.team.exploration.mission.results import mean_band, paired_interval
-from gmmtorch.team.report.mission_bars import (
-    deviations_figure,
-    summary_bars,
-)
-from gmmtorch.team.report.mission_curves import (
-    bandwidth_figure,
-    entropy_figure,
-    planner_comparison_figure,
-)
+from gmmtorch.team.report.mission_bars import deviations_figure, summary_bars
+from gmmtorch.team.report.mission_curves import bandwidth_figure, entropy_figure, planner_comparison_figure
 from gmmtorch.team.report.trial_groups import (
     FRAMEWORKS,
     framework_colour,

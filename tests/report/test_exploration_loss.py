@@ -14,8 +14,7 @@ from shown import texts
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.report.style import PALETTE
 from gmmtorch.team.exploration.mission.results import mean_band
-from gmmtorch.team.report.mission_curves import loss_figure
-from gmmtorch.team.report.trial_groups import by_variant
+from gmmtorch.team.report import by_variant, loss_figure
 
 CUT = {"begin": 60.0, "end": 120.0, "groups": [[0], [1, 2]]}
 

@@ -12,11 +12,9 @@ from exploration_rows import flights
 from matplotlib.colors import to_rgb
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.report.ellipsoids import cut_away
-from gmmtorch.report.map_images import MapImage, highest_occupancy
-from gmmtorch.report.scene_renderer import Camera, Canvas, render
-from gmmtorch.report.scenes import mixture_scene_figure, smooth_path
-from gmmtorch.report.style import UNKNOWN
+from gmmtorch.report import UNKNOWN, Camera, MapImage, cut_away, highest_occupancy, mixture_scene_figure
+from gmmtorch.report.scene_renderer import Canvas, render
+from gmmtorch.report.scenes import smooth_path
 from gmmtorch.team.exploration.planning.primitives import Dynamics, Primitives
 from gmmtorch.team.exploration.world.scoring import BeliefRule
 from gmmtorch.team.report.mission_maps import TeamSnapshot, team_map_figure, trajectories_figure

@@ -12,11 +12,7 @@ import torch
 from exploration_rows import flights, trial
 
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
-from gmmtorch.team.report.mission_maps import (
-    _log_robot,
-    load_rerun,
-    record_rerun,
-)
+from gmmtorch.team.report.mission_maps import _log_robot, load_rerun, record_rerun
 
 needs_rerun = pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="needs rerun-sdk")
 

@@ -10,9 +10,7 @@ from PIL import Image
 from gmmtorch.datasets import load
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.occupancy import Evidence, SparseEvidence, VoxelGrid
 from gmmtorch.report import style
 from gmmtorch.report.map_figures import GrowthFrame, map_figure, save_growth
 from gmmtorch.report.map_images import MapPanel, height_image, robust_bounds, roof_above, slice_image

@@ -10,15 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
 
-from gmmtorch.report.style import (
-    Label,
-    draw_grid,
-    figure_title,
-    label_axes,
-    log_axis,
-    new_figure,
-    place_labels,
-)
+from gmmtorch.report import Label, draw_grid, figure_title, label_axes, log_axis, new_figure, place_labels
 
 
 def labelled(values: list[float], axis: str = "y") -> list[float]:

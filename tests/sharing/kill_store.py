@@ -31,9 +31,7 @@ from pathlib import Path
 import torch
 from sharing.schedules import act
 
-from gmmtorch.team.sharing import store
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
+from gmmtorch.team.sharing import Replica, Store, store
 
 LIVES = 20
 """Of one robot; then another begins without a file."""

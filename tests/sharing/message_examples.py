@@ -11,14 +11,12 @@ import torch
 from hypothesis import strategies as st
 from mapping.random_components import painted, random_components
 
-from gmmtorch.mapping.codec.quantization import spatial_order
-from gmmtorch.mapping.components import Components
+from gmmtorch.mapping import Components, spatial_order
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
+from gmmtorch.team.sharing import ViewsMessage, encode_plan
 from gmmtorch.team.sharing.messages.component_messages import encode_components, encode_counts
 from gmmtorch.team.sharing.messages.datagrams import CODECS, pose_of
 from gmmtorch.team.sharing.messages.mission_messages import (
-    ViewsMessage,
-    encode_plan,
     encode_points,
     encode_views,
     quantized_poses,

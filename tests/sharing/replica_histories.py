@@ -12,15 +12,13 @@ import torch
 from sharing.schedules import act
 
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing import Broadcast, Replica, decode
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, counts_of
-from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     CorrectionMessage,
     CountersMessage,
     SupersessionMessage,
 )
-from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def exchange(replicas: list[Replica], rounds: int = 6) -> None:

@@ -17,13 +17,11 @@ import torch
 from mapping.random_components import painted, random_components
 from torch import Tensor
 
-from gmmtorch.mapping.codec.component_batch import has_channels
-from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.messages.message_registry import Message, decode
+from gmmtorch.mapping import Components, has_channels
+from gmmtorch.team.sharing import Message, Replica, decode
 from gmmtorch.team.sharing.messages.record_messages import AnnouncementMessage
 from gmmtorch.team.sharing.replica import authorship
 from gmmtorch.team.sharing.replica.record_keys import Intervals
-from gmmtorch.team.sharing.replica.replica import Replica
 
 MOST_ROUNDS = 8
 """Rounds of announcements and answers without loss after which all replicas agree."""

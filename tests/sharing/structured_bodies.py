@@ -18,10 +18,8 @@ import numpy as np
 import torch
 from mapping.random_components import random_components
 
-from gmmtorch.mapping.codec.bitstream import BitWriter
-from gmmtorch.mapping.codec.component_batch import encode_quantized
+from gmmtorch.mapping import BitWriter, Quantized, encode_quantized, quantize
 from gmmtorch.mapping.codec.lattice import Lattice
-from gmmtorch.mapping.codec.quantization import Quantized, quantize
 from gmmtorch.mapping.codec.thesis_message import UPDATE_TYPE, message_type
 from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, Kind, first_byte
 from gmmtorch.team.sharing.replica.record_keys import END

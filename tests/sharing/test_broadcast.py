@@ -15,14 +15,13 @@ from sharing.replica_histories import Follower, rows, told
 
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing import Broadcast, decode
 from gmmtorch.team.sharing.messages.component_messages import (
     ComponentsMessage,
     CountsMessage,
     encode_components,
     encode_counts,
 )
-from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import encode_announcements
 from gmmtorch.team.sharing.replica.record_keys import Intervals
 

@@ -18,6 +18,7 @@ from sharing.message_examples import codecs, examples, frame_of_components, numb
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
+from gmmtorch.team.sharing import MAX_BYTES, PlanMessage, PointsMessage, decode, encode_plan
 from gmmtorch.team.sharing.messages.component_messages import (
     MOST_COMPONENTS_SENT,
     CountsMessage,
@@ -25,13 +26,10 @@ from gmmtorch.team.sharing.messages.component_messages import (
     encode_counts,
     fitted,
 )
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST, MAX_BYTES, Kind, first_byte
-from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind, first_byte
+from gmmtorch.team.sharing.messages.message_registry import kind_of
 from gmmtorch.team.sharing.messages.mission_messages import (
     POINTS_PER_DATAGRAM,
-    PlanMessage,
-    PointsMessage,
-    encode_plan,
     encode_points,
     encode_views,
     quantized_poses,

@@ -14,15 +14,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
+from gmmtorch.team.sharing import POINT_CODECS, bytes_of_points
 from gmmtorch.team.sharing.point_codecs import (
-    POINT_CODECS,
     DepthImage,
     Draco,
     Octree,
     PointCodec,
     QuantizedPoints,
     RawPoints,
-    bytes_of_points,
     point_codec,
 )
 

@@ -15,10 +15,9 @@ from sharing.schedules import components
 from torch import Tensor
 
 from gmmtorch.mapping.components import Components
+from gmmtorch.team.sharing import MovedMap, Replica
 from gmmtorch.team.sharing.messages.record_messages import CorrectionMessage
 from gmmtorch.team.sharing.replica import authorship
-from gmmtorch.team.sharing.replica.authorship import MovedMap
-from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def changed(rng: random.Random, before: Components) -> Components:

@@ -18,9 +18,9 @@ from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR
 from gmmtorch.occupancy.calibrator import Calibrator
+from gmmtorch.team.sharing import MAX_BYTES, Replica, decode
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, counts_of, encode_components
-from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, pose_of, write_intervals, write_keys
-from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing.messages.datagrams import pose_of, write_intervals, write_keys
 from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_KINDS,
     AnnouncementMessage,
@@ -34,14 +34,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
 )
 from gmmtorch.team.sharing.replica.anti_entropy import MOST_PEERS, Backlog
 from gmmtorch.team.sharing.replica.materialized_view import Counters
-from gmmtorch.team.sharing.replica.record_keys import (
-    END,
-    Intervals,
-    evict,
-    first_key,
-    keys_of,
-)
-from gmmtorch.team.sharing.replica.replica import Replica
+from gmmtorch.team.sharing.replica.record_keys import END, Intervals, evict, first_key, keys_of
 
 numbers = st.sets(st.integers(0, 40))
 

@@ -16,9 +16,8 @@ from sharing.replica_histories import everything, exchange, history, replica_of
 
 import gmmtorch as gt
 from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.team.sharing import MAX_BYTES, Replica, decode
 from gmmtorch.team.sharing.messages.component_messages import encode_components, encode_counts
-from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES
-from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
     RECORD_BYTES,
     AnnouncementMessage,
@@ -31,7 +30,6 @@ from gmmtorch.team.sharing.replica import anti_entropy, records
 from gmmtorch.team.sharing.replica.anti_entropy import PATIENCE
 from gmmtorch.team.sharing.replica.record_keys import END, Intervals, first_key, ids_of
 from gmmtorch.team.sharing.replica.records import MOST_VIEWPOINTS
-from gmmtorch.team.sharing.replica.replica import Replica
 
 # -- restarts --------------------------------------------------------------------------------------
 

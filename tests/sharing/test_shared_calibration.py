@@ -15,10 +15,9 @@ from mapping.random_components import random_components
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.occupancy.calibrator import Calibration, Calibrator
-from gmmtorch.team.sharing.messages.message_registry import decode
+from gmmtorch.team.sharing import Replica, decode
 from gmmtorch.team.sharing.messages.record_messages import CalibrationMessage, encode_record
 from gmmtorch.team.sharing.replica.record_keys import first_key
-from gmmtorch.team.sharing.replica.replica import Replica
 
 
 def learned(n_predicted: int, shift: float = 0.0, mean_range: float = 12.0) -> Calibration:

@@ -16,19 +16,13 @@ from sharing.replica_histories import exchange, same_attributes, told_twice
 from sharing.schedules import Older, act, run_schedule
 
 import gmmtorch as gt
+from gmmtorch import Components
 from gmmtorch.errors import DataError
-from gmmtorch.mapping.attributes.moments import Attributes, Labels, Numbers
-from gmmtorch.mapping.codec.bitstream import BitWriter
+from gmmtorch.mapping import Attributes, BitWriter, Labels, Numbers, encode, has_channels, quantized
 from gmmtorch.mapping.codec.component_batch import decode as decode_batch
-from gmmtorch.mapping.codec.component_batch import encode, has_channels
-from gmmtorch.mapping.codec.quantization import quantized
-from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing.broadcast import Broadcast
+from gmmtorch.team.sharing import Broadcast, Replica, Store, decode
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, encode_components
-from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.replica import records
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.store import Store
 
 seeds = st.integers(0, 10**6)
 COLOURED = b"\x11\x03"

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.components import Components
-from gmmtorch.team.sharing import Replica
+from gmmtorch.team.sharing import Network, Replica, SharedMap
 from gmmtorch.team.sharing.radio import TokenBucket
-from gmmtorch.team.sharing.shared_map import SharedMap
-from gmmtorch.team.sharing.transport.simulated_network import LinkConditions, Network
+from gmmtorch.team.sharing.transport.simulated_network import LinkConditions
 
 
 def of_robot(components: Components, robot: int) -> Components:

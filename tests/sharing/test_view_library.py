@@ -13,11 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.team.sharing import view_library
-from gmmtorch.team.sharing.messages.message_registry import decode
-from gmmtorch.team.sharing.messages.mission_messages import ViewsMessage
+from gmmtorch.team.sharing import ViewLibrary, ViewsMessage, decode, view_library
 from gmmtorch.team.sharing.replica.record_keys import Intervals, first_key, robot_of
-from gmmtorch.team.sharing.view_library import ViewLibrary
 
 
 def key(robot: int, number: int) -> int:

@@ -17,11 +17,10 @@ import pytest
 from sharing.transport_cases import KEY, Heard, heard, hostile_frames, until
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError
-from gmmtorch.team.sharing.radio import Radio
+from gmmtorch.team.sharing import Radio, Transport, ZenohTransport
 from gmmtorch.team.sharing.transport import zenoh_transport
 from gmmtorch.team.sharing.transport.security import Sealer
-from gmmtorch.team.sharing.transport.simulated_network import Traffic, Transport
-from gmmtorch.team.sharing.transport.zenoh_transport import ZenohTransport
+from gmmtorch.team.sharing.transport.simulated_network import Traffic
 
 zenoh = pytest.importorskip("zenoh")
 Opening = Callable[..., ZenohTransport]

@@ -10,10 +10,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.simulation import DepthCamera
-from gmmtorch.simulation.furniture import box
-from gmmtorch.simulation.mesh_world import MeshWorld
-from gmmtorch.simulation.sensors import depth_camera
+from gmmtorch.simulation import DepthCamera, MeshWorld, box, depth_camera
 
 LOW, HIGH = torch.tensor([0.0, 0, 0]).double(), torch.tensor([9.0, 7, 4]).double()
 ROOM = MeshWorld(box((0, 0, 0), (9, 7, 4)))

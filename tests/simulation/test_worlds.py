@@ -15,14 +15,7 @@ from torch import Tensor
 
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.occupancy.voxels.cells import Box, occupied_cells
-from gmmtorch.simulation import (
-    World2D,
-    World3D,
-    building_2d,
-    building_3d,
-    poses_3d,
-    spinning_lidar,
-)
+from gmmtorch.simulation import World2D, World3D, building_2d, building_3d, poses_3d, spinning_lidar
 from gmmtorch.simulation.furniture import UNIT_CUBE, Footprint, Room, box, circle, copies, place
 from gmmtorch.simulation.mesh_world import MeshWorld, checked_triangles
 from gmmtorch.simulation.mine import tunnels

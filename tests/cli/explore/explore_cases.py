@@ -6,11 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from cli.command_runs import (
-    QUIET,
-    Finished,
-    run_here,
-)
+from cli.command_runs import QUIET, Finished, run_here
 
 Run = Callable[..., Finished]
 FIELDS = {

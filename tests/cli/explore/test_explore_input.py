@@ -7,11 +7,7 @@ import sys
 from types import SimpleNamespace
 
 import pytest
-from cli.command_runs import (
-    QUIET,
-    refused,
-    run_here,
-)
+from cli.command_runs import QUIET, refused, run_here
 from cli.explore.explore_cases import SMALL
 
 from gmmtorch.team.cli.explorations import warn_of_robots_at_their_start

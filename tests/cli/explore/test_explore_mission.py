@@ -8,11 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cli.command_runs import (
-    Finished,
-    run_here,
-    succeeded,
-)
+from cli.command_runs import Finished, run_here, succeeded
 from cli.explore.explore_cases import FIELDS
 
 import gmmtorch

@@ -11,13 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from cli.command_runs import (
-    CHECKOUT,
-    QUIET,
-    environment,
-    succeeded,
-    timeless,
-)
+from cli.command_runs import CHECKOUT, QUIET, environment, succeeded, timeless
 from cli.explore.explore_cases import FIELDS, SMALL
 
 STUDY = [

@@ -19,27 +19,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from cli.command_runs import (
-    CHECKOUT,
-    QUIET,
-    Disk,
-    Finished,
-    environment,
-    refused,
-    room_mesh,
-    succeeded,
-)
+from cli.command_runs import CHECKOUT, QUIET, Disk, Finished, environment, refused, room_mesh, succeeded
 from cli.robot.robot_cases import LOG, SMALL
 from exploration.replays import content
 
 from gmmtorch.mapping.gaussian_map import GaussianMap
 from gmmtorch.team.cli import from_options, robot
 from gmmtorch.team.exploration.mission.replay import ReplayMission
-from gmmtorch.team.sharing.messages.mission_messages import encode_plan
-from gmmtorch.team.sharing.replica.replica import Replica
-from gmmtorch.team.sharing.transport.frames import FramedTransport
-from gmmtorch.team.sharing.transport.security import TeamKey
-from gmmtorch.team.sharing.transport.udp import UdpTransport
+from gmmtorch.team.sharing import FramedTransport, Replica, TeamKey, UdpTransport, encode_plan
 
 
 @contextmanager

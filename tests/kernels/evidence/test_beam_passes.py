@@ -7,8 +7,7 @@ import torch
 from kernels.twins import by_both
 from torch import Tensor
 
-from gmmtorch.kernels import kernels
-from gmmtorch.kernels.evidence.beam_passes import PassLimits, beam_passes
+from gmmtorch.kernels import PassLimits, beam_passes, kernels
 from gmmtorch.occupancy.cones import whitening
 
 LIMITS = PassLimits(through=1.0, reach=3.0, margin=0.3, grazing=4.0, explained=7.8)

@@ -8,9 +8,8 @@ from kernels.cones_for_kernels import cones_of
 from kernels.twins import by_both
 
 from gmmtorch.kernels import kernels
-from gmmtorch.occupancy.cones import Cones, candidate_pairs
-from gmmtorch.occupancy.forms.flux import cell_flux, flux_evidence
-from gmmtorch.occupancy.grid import VoxelGrid
+from gmmtorch.occupancy import Cones, VoxelGrid, cell_flux, flux_evidence
+from gmmtorch.occupancy.cones import candidate_pairs
 
 
 def cones_around_the_grid(dim: int, kind: str) -> Cones:

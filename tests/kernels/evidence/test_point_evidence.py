@@ -10,14 +10,12 @@ from hypothesis import strategies as st
 from kernels.cones_for_kernels import cones_of
 from kernels.twins import by_both
 
-from gmmtorch.kernels import kernels
-from gmmtorch.kernels.evidence.point_evidence import Lists
+from gmmtorch.kernels import Lists, kernels
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.windows import SIDES, few_points
 from gmmtorch.mapping.query import Block
+from gmmtorch.occupancy import Cones, PointForm
 from gmmtorch.occupancy.cone_index import Hulls
-from gmmtorch.occupancy.cones import Cones
-from gmmtorch.occupancy.forms.point import PointForm
 
 
 def points_of(cones: Cones) -> torch.Tensor:
@@ -89,11 +87,10 @@ def test_evidence_of_points_with_gradients_comes_from_the_twin():
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("kind", ["any", "flat", "around"])
 @pytest.mark.parametrize("smoothed", [False, True])
-def test_fused_hull_tests_equal_the_twin(dim, kind, smoothed):
+def test_fused_hull_tests_equal_the_twin(dim, kind, smoothed, generator):
     cones = cones_of(dim, kind)
     points = points_of(cones)
     points = points[torch.isfinite(points).all(1)]
-    generator = torch.Generator().manual_seed(0)
     n_cones = len(cones.means)
     given = Lists.of(torch.tensor([n_cones, 0, 3]), torch.randint(n_cones, (n_cones + 3,)).int())
     lists = torch.randint(3, (len(points),), generator=generator)

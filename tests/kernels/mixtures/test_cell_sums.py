@@ -13,9 +13,8 @@ from kernels.twins import by_both
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.kernels import kernels
+from gmmtorch.kernels import CutRule, DepthViews, depth_cells, distinct_keys, kernels, piece_cuts
 from gmmtorch.kernels.compiler import Team
-from gmmtorch.kernels.mixtures.cell_sums import CutRule, DepthViews, depth_cells, distinct_keys, piece_cuts
 from gmmtorch.linalg import dense_ranks, order_along_curve
 from gmmtorch.mapping.attributes.moments import _cell_sums
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
@@ -201,8 +200,7 @@ def test_cells_of_points_are_those_of_the_twin(n, dim, seed, finest, share, is_w
 
 @pytest.mark.cpu_only
 @pytest.mark.parametrize("kind", ["few", "many", "equal", "extreme", "strided"])
-def test_hashed_ranks_equal_the_sorted_ones(kind):
-    generator = torch.Generator().manual_seed(0)
+def test_hashed_ranks_equal_the_sorted_ones(kind, generator):
     keys = torch.randint(0, 300 if kind == "few" else 1 << 40, (20_000,), generator=generator)
     if kind == "equal":
         keys = torch.full_like(keys, 7)

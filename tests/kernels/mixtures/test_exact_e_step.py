@@ -15,13 +15,8 @@ from gmmtorch.kernels import kernels
 from gmmtorch.kernels.compiler import FusedKernel
 from gmmtorch.kernels.mixtures import em_steps
 from gmmtorch.linalg import order_along_curve
-from gmmtorch.mixture.em.exact import (
-    Parameters,
-    natural_of_precisions,
-    natural_parameters,
-    quadratic_features,
-    shift_features,
-)
+from gmmtorch.mixture import Parameters, shift_features
+from gmmtorch.mixture.em.exact import natural_of_precisions, natural_parameters, quadratic_features
 
 FAINT = 2.0**-10  # nats: the largest error of a log-density in float32
 DTYPES = [torch.float64, torch.float32]

@@ -14,8 +14,7 @@ from gmmtorch.kernels.compiler import compiler_failure
 from gmmtorch.kernels.mixtures import matching
 from gmmtorch.localization.alignment import AlignmentTarget, align
 from gmmtorch.localization.registration import register
-from gmmtorch.mapping.components import Components
-from gmmtorch.mapping.learning.novelty import count_explained
+from gmmtorch.mapping import Components, count_explained
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.pose import Pose
 

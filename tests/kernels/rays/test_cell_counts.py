@@ -134,8 +134,7 @@ def test_fused_sums_of_removed_entropy_are_those_of_the_twin(n, prior, clamp):
 
 
 @pytest.mark.parametrize("margin", [0, 1])
-def test_fused_reduction_along_rays_is_that_of_the_twin(margin):
-    generator = torch.Generator().manual_seed(0)
+def test_fused_reduction_along_rays_is_that_of_the_twin(margin, generator):
     shape = (9, 14, 7)
     hits, misses = (counts(9 * 14 * 7, seed).view(shape) for seed in (0, 1))
     size = torch.tensor(shape, dtype=torch.float64)

@@ -9,13 +9,8 @@ import torch
 from kernels.twins import by_both
 from torch import Tensor
 
-from gmmtorch.kernels import kernels
-from gmmtorch.kernels.rays.ray_traversal import count_in_grid, mark_cells_of_rays
-from gmmtorch.occupancy.evidence import Evidence
-from gmmtorch.occupancy.grid import VoxelGrid
-from gmmtorch.occupancy.voxels.cells import Box
-from gmmtorch.occupancy.voxels.ray_casting import cast_evidence
-from gmmtorch.occupancy.voxels.sparse_evidence import SparseEvidence
+from gmmtorch.kernels import count_in_grid, kernels, mark_cells_of_rays
+from gmmtorch.occupancy import Box, Evidence, SparseEvidence, VoxelGrid, cast_evidence
 
 
 def rays(dim: int, kind: str, n: int = 3000) -> tuple[Tensor, Tensor]:

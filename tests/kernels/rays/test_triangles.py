@@ -203,8 +203,7 @@ def test_hostile_meshes_make_no_deep_tree(device):
         assert depth_of(tree) < 100
 
 
-def test_a_million_triangles():
-    generator = torch.Generator().manual_seed(0)
+def test_a_million_triangles(generator):
     side = torch.arange(708, dtype=DTYPE) / 707
     height = 0.02 * torch.rand(708, 708, generator=generator, dtype=DTYPE)
     grid = torch.stack([*torch.meshgrid(side, side, indexing="ij"), height], -1)
