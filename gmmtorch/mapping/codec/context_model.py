@@ -121,7 +121,9 @@ class _Walk:
         self.places, self.normals = np.zeros(batch.mean.shape), np.zeros(batch.mean.shape)
         self.offset = offset_of(self.side)
         # Lists of Python numbers, which are faster one by one than arrays.
-        self.v = {name: value.tolist() for name, value in vars(batch).items() if isinstance(value, Tensor)}
+        self.v = {
+            name: value.tolist() for name, value in vars(batch).items() if isinstance(value, np.ndarray)
+        }
         self.last, self.unit = self.dim - 1, 1 + batch.coarse
         self.eye = [0.0] * self.dim
         self.is_round = False  # whether the component is near a sphere around the only origin

@@ -77,4 +77,4 @@ def test_values_out_of_bounds_have_the_errors_of_the_twin(value):
 def test_steps_of_deviations_are_rounded_logarithms():
     variances = torch.tensor(np.geomspace(1e-14, 1e13, 100_001))
     expected = np.round(np.log2(variances.numpy()) * lattice.PER_OCTAVE / 2)
-    assert lattice._deviation_steps(variances).tolist() == expected.tolist()
+    assert lattice._deviation_steps(variances, coarse=False).tolist() == expected.tolist()

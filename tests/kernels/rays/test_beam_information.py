@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from kernels.twins import by_both
+from numpy.typing import NDArray
 
 from gmmtorch.kernels import kernels
 from gmmtorch.team.exploration.planning.collision_checking import LocalMap
@@ -39,10 +41,10 @@ def maps() -> dict[str, LocalMap]:
     }
 
 
-def views() -> torch.Tensor:
+def views() -> NDArray[np.int64]:
     """Inside, at the border, in the corners, and outside, with every heading."""
     places = [[0, 0, 0], [-6, -6, -3], [5, 5, 3], [-6, 0, 0], [2, -3, 1], [6, 0, 0], [0, 0, -40]]
-    return torch.tensor([[*place, yaw] for place in places for yaw in range(16)])
+    return np.array([[*place, yaw] for place in places for yaw in range(16)])
 
 
 @pytest.mark.parametrize("information", ["csqmi", "fsmi"])
