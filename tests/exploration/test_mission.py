@@ -313,9 +313,10 @@ def test_two_processes_hold_the_map_of_one_process_that_received_everything(hall
 
     monkeypatch.setattr(UdpTransport, "send", observed)
     with transports(2) as links:
-        missions = [mission_of(k, hall, TEAM, links[k], incarnation=7 + k) for k in range(2)]
+        options = replace(TEAM, duration=8.0)
+        missions = [mission_of(k, hall, options, links[k], incarnation=7 + k) for k in range(2)]
         agents = [mission.agents[0] for mission in missions]
-        assert drive(Together(*missions), clock).ticks == 4
+        assert drive(Together(*missions), clock).ticks == 8
 
         def are_equal() -> bool:
             return agents[0].digest() == agents[1].digest()
