@@ -41,7 +41,7 @@ from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_att
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.context_model import read_batch, write_batch
 from gmmtorch.mapping.codec.first_version import read_first
-from gmmtorch.mapping.codec.lattice import COARSER, Lattice, nearest
+from gmmtorch.mapping.codec.lattice import AXIS_ORDERS, COARSER, Lattice, nearest
 from gmmtorch.mapping.codec.quantization import (
     LARGEST_SIDE,
     LEAST_SIDE,
@@ -107,8 +107,11 @@ def _geometry(values: Quantized) -> bytes:
 def _coarse_places(values: Quantized) -> Lattice | None:
     """The means and covariances on the coarse lattice, perhaps with other axis orders; None unless all
     components are on it."""
-    if not len(values) or not np.array_equal(count := values.count.numpy(), coarse_counts(count)):
+    count, order = values.count.numpy(), values.places.axis_order.numpy()
+    if not len(values) or not np.array_equal(count, coarse_counts(count)):
         return None
+    if order.min() < 0 or order.max() >= len(AXIS_ORDERS[values.places.dim]):
+        return None  # the coder refuses it
     means, covariances = values.places.restored()
     try:
         places = nearest(means, covariances, coarse=True)
