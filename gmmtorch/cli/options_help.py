@@ -97,11 +97,10 @@ _REPLACED_GROUPS = (
     ("belief.", "prior clamp free occupied", _CONSTANT % "`BeliefRule`"),
     (
         "map.",
-        "cell iterations length max_cells max_cost max_origins mean_origins planarity "
-        "min_density_share min_points min_support sampling window_components components distance "
-        "distance_for hits_per_ray novelty_block "
-        "observed rays shell threshold update_at update_every update_novel update_stride prune learner "
-        "free_points",
+        "cell iterations length max_cells max_cost max_origins mean_origins planarity min_density_share "
+        "min_points min_support sampling window_components components distance distance_for hits_per_ray "
+        "novelty_block observed rays shell threshold update_at update_every update_novel update_stride prune "
+        "learner free_points",
         _CONSTANT % "a field of the learning rule, of `QueryOptions` or of `FrameRule`; a study may vary it",
     ),
     (

@@ -69,11 +69,8 @@ def context_coding(batch: CodedBatch, tables: ChanceTables, stream: Bytes, write
     result = np.zeros(1, np.int64)
     n_items = 8 * n_origins // 7 + 16  # of the tree
     waiting, box = np.zeros(n_items, np.int64), np.zeros(n_items * 2 * batch.dim, np.int64)
-    rows, distance, shapes = (
-        np.zeros((2, n_origins), np.int64),
-        np.zeros(n_items),
-        np.zeros((2, batch.mean.size)),
-    )
+    rows, distance = np.zeros((2, n_origins), np.int64), np.zeros(n_items)
+    shapes = np.zeros((2, batch.mean.size))
     sizes = k, n_origins, len(batch.seen_from), batch.side, int(batch.coarse)
     slots = (*tables[:3], len(tables.rates) - 1, tables.first_slot)
     scratch = (*slots, rows[0], box, distance, waiting, rows[1], *shapes, batch.cells)

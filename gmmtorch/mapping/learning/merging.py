@@ -290,9 +290,8 @@ def compact_to_bytes(
     Raises `InvalidArgumentError` if a single component with one origin is too large.
     """
     device = components.means.device
-    components = limit_origins(
-        components.on_cpu(), max_origins, mean_origins
-    )  # as the size is measured there
+    here = components.on_cpu()  # where the size is measured
+    components = limit_origins(here, max_origins, mean_origins)
     last: tuple[int, int] | None = None
     numbered = True
     while (k := len(components)) and (taken := size(components)) > max_bytes:

@@ -311,7 +311,7 @@ class GmmMapper(Mapper):
             learned = novel & ~self._count(frame, novel.nonzero().squeeze(1), 1)
         if rule.update_stride is not None:
             self._count(frame, (~novel).nonzero().squeeze(1)[:: rule.update_stride], rule.update_stride)
-        components = self._learned(frame, learned).to("cpu")  # where messages are encoded
+        components = self._learned(frame, learned)
         if isinstance(self.shared, Replica):
             components = quantized(components, coarse=True)
         self.shared.add(components)
@@ -330,10 +330,9 @@ class GmmMapper(Mapper):
         return novel_beams(self.local, frame, self._width, self._novelty, within, short, side)
 
     def _learned(self, frame: DepthFrame, novel: Tensor) -> Components:
-        """The components of the novel beams."""
+        """The components of the novel beams, on the CPU, where messages are encoded."""
         scan = Scan(frame.ends[novel & frame.is_hit], frame.origin, frame.ends[novel & ~frame.is_hit])
-        found = fit_window([scan], self._rule.surface_fit(), all_origins())
-        return found.to(frame.ends.device)
+        return fit_window([scan], self._rule.surface_fit(), all_origins())
 
     def _count(self, frame: DepthFrame, chosen: Tensor, weight: int) -> Tensor:
         """Adds the beams `chosen` (M,) to the counts of the components that explain them, with a weight each;

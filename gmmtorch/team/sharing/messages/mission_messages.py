@@ -174,10 +174,8 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
         raise InvalidArgumentError(f"ids: {error}") from error
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
-    steps, values = (
-        _pose_steps("poses", m.poses)[order],
-        _value_steps(m.values.detach().double().cpu().numpy())[order],
-    )
+    steps = _pose_steps("poses", m.poses)[order]
+    values = _value_steps(m.values.detach().double().cpu().numpy())[order]
     times = _ticks("stamps", m.stamps, STAMP_TICKS)[order]
 
     def part(begin: int, end: int) -> bytes:
