@@ -214,6 +214,11 @@ GMM_KERNEL lattice_restoring(int64_t item, Lattice lattice, const int64_t* axis_
                              double* means, double* covariances) {
     Place<DIM> p;
     p.order = axis_order[item];
+    if (p.order < 0 || p.order >= lattice.n_orders) {
+        for (int a = 0; a < DIM; ++a) means[item * DIM + a] = HUGE_VAL;
+        for (int f = 0; f < DIM * DIM; ++f) covariances[item * DIM * DIM + f] = HUGE_VAL;
+        return;
+    }
     for (int a = 0; a < DIM; ++a) {
         p.steps[a] = deviation[item * DIM + a];
         p.mean[a] = (double)mean_steps[item * DIM + a];

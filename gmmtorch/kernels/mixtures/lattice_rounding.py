@@ -60,7 +60,8 @@ def lattice_rounding(
 def lattice_restoring(
     axis_order: Tensor, deviation: Tensor, shear: Tensor, mean: Tensor, constants: LatticeConstants
 ) -> tuple[Tensor, Tensor]:
-    """Means (K, D) and covariances (K, D, D), float64, of lattice points."""
+    """Means (K, D) and covariances (K, D, D), float64, of lattice points; infinite for axis orders that do
+    not exist."""
     n, dim = mean.shape
     means = torch.empty(n, dim, dtype=torch.float64, device=mean.device)
     covariances = means.new_empty(n, dim, dim)

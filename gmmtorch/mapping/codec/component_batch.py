@@ -41,7 +41,7 @@ from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_att
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter
 from gmmtorch.mapping.codec.context_model import read_batch, write_batch
 from gmmtorch.mapping.codec.first_version import read_first
-from gmmtorch.mapping.codec.lattice import AXIS_ORDERS, COARSER, Lattice, nearest
+from gmmtorch.mapping.codec.lattice import COARSER, Lattice, nearest
 from gmmtorch.mapping.codec.quantization import (
     LARGEST_SIDE,
     LEAST_SIDE,
@@ -107,15 +107,13 @@ def _geometry(values: Quantized) -> bytes:
 def _coarse_places(values: Quantized) -> Lattice | None:
     """The means and covariances on the coarse lattice, perhaps with other axis orders; None unless all
     components are on it."""
-    count, order = values.count.numpy(), values.places.axis_order.numpy()
+    count = values.count.numpy()
     if not len(values) or not np.array_equal(count, coarse_counts(count)):
         return None
-    if order.min() < 0 or order.max() >= len(AXIS_ORDERS[values.places.dim]):
-        return None  # the coder refuses it
     means, covariances = values.places.restored()
     try:
         places = nearest(means, covariances, coarse=True)
-    except InvalidArgumentError:  # rounded beyond a bound
+    except InvalidArgumentError:  # beyond a bound, or its rounding is
         return None
     found = places.restored()
     return places if all_equal([(means, found[0]), (covariances, found[1])]) else None

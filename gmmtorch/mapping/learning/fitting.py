@@ -356,7 +356,7 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     and on the CPU.
     """
     origins = torch.stack([frame.pose.translation for frame in frames])
-    is_wide = float((origins.amax(0) - origins.amin(0)).max()) > _WIDEST * fit.noise
+    is_wide = np.ptp(origins.numpy(), 0).max() > _WIDEST * fit.noise
     if is_wide or fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
     cells = pool_frames(frames, fit.cell, fit.max_cells or _MOST_CELLS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -72,6 +72,15 @@ def test_values_out_of_bounds_have_the_errors_of_the_twin(value):
             lattice.nearest(means, covariances)
         messages.append(str(caught.value))
     assert messages[0] == messages[1]
+
+
+@pytest.mark.parametrize("order", [-1, 6, 1 << 40])
+def test_axis_orders_that_do_not_exist_are_restored_beyond_all_bounds(order):
+    places = lattice.nearest(torch.zeros(1, 3).double(), torch.eye(3).double()[None])
+    with kernels("fused"):
+        means, covariances = replace(places, axis_order=torch.tensor([order])).restored()
+    assert means.isinf().all()
+    assert covariances.isinf().all()
 
 
 def test_steps_of_deviations_are_rounded_logarithms():
