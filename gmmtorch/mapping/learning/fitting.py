@@ -355,7 +355,7 @@ def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: Assign
     The images are summed into cells at once, without a list of their points. Components are not numbered,
     and on the CPU.
     """
-    origins = torch.stack([frame.pose.translation for frame in frames])
+    origins = torch.stack([frame.pose.translation for frame in frames]).detach()
     is_wide = np.ptp(origins.numpy(), 0).max() > _WIDEST * fit.noise
     if is_wide or fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
         return fit_window([frame.scan() for frame in frames], fit, viewpoints)
