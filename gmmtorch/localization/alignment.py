@@ -48,6 +48,8 @@ _MOST_CELLS = 1 << 20  # of the lists, and entries
 _RIDGE = 1e-9
 _TURNED = math.radians(10)  # between the headings of neighbouring starts, for each metre between their places
 _FLAT = 0.25  # of the next deviation: thinner components have a face
+_THIN = 0.1  # metres of deviation of a surface that tells a direction
+_PARALLEL, _ANOTHER = math.radians(6), math.radians(30)  # between normals of one direction, and of two
 
 
 class Alignment(NamedTuple):
@@ -253,11 +255,41 @@ def around(start: Pose, distance: float, angle: float, blur: float) -> Pose:
     return _crossed(turned.rotation @ start.rotation, like + places)
 
 
-def everywhere(places: Tensor, blur: float) -> Pose:
-    """Starts at places (S, D) with all headings; upright in 3D."""
+def everywhere(places: Tensor, blur: float, axes: Tensor, targets: Tensor) -> Pose:
+    """Starts in space at places (S, 3), with all headings about each of some axes (A, 3) of the map, to which
+    they turn the axes (A, 3) of the sensor.
+    """
     n = math.ceil(math.pi / (_TURNED * blur))
     angles = torch.arange(n).to(places) * (2 * math.pi / n)
-    return _crossed(Pose.from_yaw(angles, torch.zeros_like(places[0])).rotation, places)
+    headings = Pose.from_yaw(angles, torch.zeros_like(places[0])).rotation
+    turned = _frames(targets)[:, None] @ headings @ _frames(axes).mT[:, None]
+    return _crossed(turned.flatten(0, 1), places)
+
+
+def main_normals(surfaces: Parameters, most: int = 3) -> Tensor:
+    """Unit vectors (A, 3), A at most `most`, of either sign: the normal of most of the flat area, then of
+    most of what is left when the surfaces about parallel to it are taken away. Indoors these are up and the
+    directions of two walls.
+    """
+    variances, axes = torch.linalg.eigh(surfaces.covariances)
+    normals = axes[:, :, 0]
+    is_flat = (variances[:, 0] < _THIN**2) & (variances[:, 0] < _FLAT**2 * variances[:, 1])
+    area = torch.where(is_flat, (variances[:, 1] * variances[:, 2]).clamp_min(0).sqrt(), 0.0)
+    found = normals[:0]
+    while len(found) < most and bool((area > 0).any()):
+        alike = torch.where((normals[area > 0] @ normals.mT).abs() > math.cos(_PARALLEL), area, 0.0)
+        alike = alike[alike.sum(1).argmax()]
+        main = torch.linalg.eigh((normals * alike[:, None]).mT @ normals).eigenvectors[:, -1]
+        found = torch.cat([found, main[None]])
+        area = torch.where((normals @ main).abs() > math.cos(_ANOTHER), 0.0, area)
+    return found
+
+
+def _frames(axes: Tensor) -> Tensor:
+    """Rotations (A, 3, 3) that turn z to the unit vectors (A, 3)."""
+    other = torch.nn.functional.one_hot(axes.abs().argmin(1), 3).to(axes)
+    x = torch.nn.functional.normalize(torch.linalg.cross(other, axes))
+    return torch.stack([x, torch.linalg.cross(axes, x), axes], 2)
 
 
 def _crossed(rotations: Tensor, translations: Tensor) -> Pose:

@@ -20,6 +20,7 @@ from gmmtorch.localization.alignment import Alignment, AlignmentTarget
 from gmmtorch.localization.location import UNSEEN, Location, continued, measured_motion, pose_covariance
 from gmmtorch.localization.pose_search import CORRELATED, PoseSearch, free_segments
 from gmmtorch.mapping import Components, GaussianMap, Surfaces, surface_mixture
+from gmmtorch.mixture import surface_pieces
 from gmmtorch.pose import Pose
 from gmmtorch.scan import check_positions
 
@@ -31,8 +32,10 @@ _BETWEEN_STEPS = 6  # of the levels between, which only lead to the peak of the 
 _COARSE_SHARE = 0.4  # of the points, on all levels but the last one
 _SAME = 0.25  # of the blur: motions that are closer have climbed one peak
 _SECOND_CHANCE = 1  # the level after the first: starts are ranked there once more, by its blur
-_CLIMBED = 6  # starts that the first level climbs; each level after it climbs the better half
+_CLIMBED, _MORE_CLIMBED = 6, 24  # starts that the first level climbs; later levels climb the better half
 _RASTERED = 16  # starts from the raster of a map in 2D, which are climbed as they are
+_LIKELY = 2  # tilts of a sensor in space that are searched first
+_NOISE = 0.03  # metres of a scan whose flat pieces tell how the sensor is tilted
 _PLACES = 0.5  # metres between the places of a search of the whole map
 _RANKED = 8 * _CLIMBED  # best starts, of which different ones are climbed
 _RANKING_POINTS = 150  # of the scan, that rank the starts
@@ -53,13 +56,25 @@ _BEAMS, _BEAM_POINTS = 60, 64  # of the scan, and of each beam, which are asked
 _MOST_CONTRADICTED = 1.5  # times the share that need not be explained
 
 
+class _Search(NamedTuple):
+    """The first level; the starts; the share of explained points that ends the search; and how many starts
+    are climbed.
+    """
+
+    level: int
+    starts: Pose
+    is_enough: float = 0.0
+    n_climbed: int = _CLIMBED
+
+
 class Tracker:
     """Localises the scans of a sensor, one after the other, in a map that does not change.
 
     A scan is aligned with the surfaces of the map (`localization.alignment`), from the pose that the last
     motion predicts. If this fails, starts around the prediction are tried, then four times as far. After
     a lost scan, and for the first scan without a pose, the whole map is searched: in 2D by branch and bound
-    (`localization.pose_search`), in 3D all headings at the places from which the map was seen.
+    (`localization.pose_search`), in 3D all headings at the places from which the map was seen, with the tilts
+    that make the scan's floor or walls parallel to those of the map.
 
     Args:
         surfaces: a map, its components, or (means, covariances, weights).
@@ -96,7 +111,7 @@ class Tracker:
         self.dim = mixture.means.shape[1]
         self._map = surfaces if isinstance(surfaces, GaussianMap) else None
         self._center = mixture.means.mean(0)  # numbers stay small anywhere in the world
-        centered = mixture._replace(means=mixture.means - self._center)
+        self._mixture = centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
         self._seen = seen if isinstance(seen, Components) else None
         normals = (
@@ -146,16 +161,16 @@ class Tracker:
         measured = None if motion is None else measured_motion(motion, self.dim, self._center.device)
         measured = continued(measured, self._motion) if isinstance(measured, Tensor) else measured
         predicted = self._predicted(measured)
-        rows = rows[rows.norm(dim=1) > _NEAREST]
+        cloud = rows = rows[rows.norm(dim=1) > _NEAREST]
         drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[: self.n_points]
         rows = rows[drawn.to(rows.device)]
         best: Location | None = None
-        searches = self._searches(rows, predicted, measured is not None) if len(rows) else ()
-        for level, starts, is_enough in searches:
-            found = self._climbed(rows, starts, level)
+        searches = self._searches(cloud, rows, predicted, measured is not None) if len(rows) else ()
+        for search in searches:
+            found = self._climbed(rows, search)
             if best is None or (found.found, found.explained) > (best.found, best.explained):
                 best = found
-            if best.found and best.explained >= is_enough:
+            if best.found and best.explained >= search.is_enough:
                 break
         best = self._nothing(predicted) if best is None else self._questioned(best, predicted)
         self._remember(best, predicted, measured is not None)
@@ -179,26 +194,45 @@ class Tracker:
         return self._last if self._last is None or step is None else self._last @ step
 
     def _searches(
-        self, rows: Tensor, predicted: Pose | None, is_measured: bool
-    ) -> Iterator[tuple[int, Pose, float]]:
-        """First level, starts, and the explained share that ends the search; the cheapest search first."""
+        self, cloud: Tensor, rows: Tensor, predicted: Pose | None, is_measured: bool
+    ) -> Iterator[_Search]:
+        """The cheapest search first."""
         if predicted is not None:
-            start = predicted[None]
+            start, usual = predicted[None], _USUAL * self._explained
             if self.n_lost == 0 and (is_measured or self._motion is not None):
-                yield _FINE, start, _USUAL * self._explained
-            yield (
-                _FINE,
-                alignment.around(start, self.distance, self.angle, _BLURS[_FINE]),
-                _USUAL * self._explained,
-            )
+                yield _Search(_FINE, start, usual)
+            yield _Search(_FINE, alignment.around(start, self.distance, self.angle, _BLURS[_FINE]), usual)
             wide = _WIDER * self.distance, min(_WIDER * self.angle, math.pi)
-            yield 0, alignment.around(start, *wide, _BLURS[0]), 0.0
+            yield _Search(0, alignment.around(start, *wide, _BLURS[0]))
         if len(self._places) and (predicted is None or self.n_lost >= _GLOBAL_AFTER):
             if self._raster is None:
-                yield _FINE, alignment.everywhere(self._places, _BLURS[_FINE]), 0.0
+                axes, targets = self._tilts(cloud)
+                for n_axes, n_climbed in (_LIKELY, _CLIMBED), (len(axes), _MORE_CLIMBED):
+                    turned = axes[:n_axes], targets[:n_axes]
+                    yield _Search(0, alignment.everywhere(self._places, _BLURS[0], *turned), 0.0, n_climbed)
             else:  # from the last level that blurs more than a cell of the raster
                 first = max(sum(blur >= self._raster.cell for blur in _BLURS) - 1, 0)
-                yield first, self._raster.anywhere(rows, _RASTERED)[0], 0.0
+                yield _Search(first, self._raster.anywhere(rows, _RASTERED)[0])
+
+    def _tilts(self, cloud: Tensor) -> tuple[Tensor, Tensor]:
+        """Axes (A, 3) of the sensor, and the axis (A, 3) of the map to which each may be turned. The first
+        `_LIKELY` are those of a sensor that is held about upright.
+
+        Most of the flat area of a scan is parallel to most of that of the map, or perpendicular to it.
+        """
+        up = self._center.new_tensor([0.0, 0.0, 1.0])
+        main = up if self._main is None else self._main * (1 - 2 * (self._main[2] < 0))
+        ones = torch.ones(len(cloud)).to(cloud)
+        pieces, _ = surface_pieces(cloud - cloud.mean(0), ones, _NOISE, _NOISE**2)
+        axes = alignment.main_normals(pieces)
+        axes = torch.cat([axes, -axes])
+        axes = axes[axes[:, 2].argsort(descending=True)]
+        return torch.cat([up[None], axes]), torch.cat([up[None], main.expand(len(axes), 3)])
+
+    @functools.cached_property
+    def _main(self) -> Tensor | None:
+        """The normal (3,) of most of the map's flat area; None if there is no such area."""
+        return next(iter(alignment.main_normals(self._mixture, 1)), None)
 
     @functools.cached_property
     def _raster(self) -> PoseSearch | None:
@@ -207,13 +241,14 @@ class Tracker:
             return None
         return PoseSearch.of_map(self._seen, self._center)
 
-    def _climbed(self, rows: Tensor, starts: Pose, first: int) -> Location:
-        """The location that the levels from `first` on reach from the best of the starts."""
-        motions = self._ranked(rows, starts, self._targets[first])
+    def _climbed(self, rows: Tensor, search: _Search) -> Location:
+        """The location that the levels from the first one on reach from the best of the starts."""
+        first, starts, _, most = search
+        motions = self._ranked(rows, starts, self._targets[first], most)
         n_starts, are_all = len(motions), len(motions) == len(starts)
         for number, target in enumerate(self._targets[first:]):
             if number == _SECOND_CHANCE and not are_all:
-                motions = Pose.cat([motions, self._ranked(rows, starts, target)])
+                motions = Pose.cat([motions, self._ranked(rows, starts, target, most)])
             is_last = target is self._targets[-1]
             used = rows if is_last else rows[: max(_RANKING_POINTS, int(_COARSE_SHARE * len(rows)))]
             found = alignment.align(
@@ -224,8 +259,8 @@ class Tracker:
             motions = found.motions
         return self._location(rows, found, is_tracked=len(starts) == 1)
 
-    def _ranked(self, rows: Tensor, starts: Pose, target: AlignmentTarget) -> Pose:
-        """The best starts that differ from each other, at most `_CLIMBED`; all of them if they are few."""
+    def _ranked(self, rows: Tensor, starts: Pose, target: AlignmentTarget, most: int) -> Pose:
+        """The best starts that differ from each other, at most `most`; all of them if they are few."""
         if len(starts) > 10 * _RANKED:
             score = target.scores(rows[:_GLIMPSE_POINTS], starts)
             starts = starts[score.topk(len(score) // 5).indices]
@@ -237,7 +272,7 @@ class Tracker:
         if n > _RANKED:
             best = order[:_RANKED]
             order = best[alignment.best_distinct(starts[best], score[best], 1.01 * target.blur)]
-        return starts[order[:_CLIMBED]]
+        return starts[order[:most]]
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
         covariance, deviation = pose_covariance(found.information[0], rows)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
 from gmmtorch.localization import alignment
-from gmmtorch.localization.alignment import AlignmentTarget, align
+from gmmtorch.localization.alignment import AlignmentTarget, align, everywhere, main_normals
 from gmmtorch.mixture.em.exact import Parameters
 from gmmtorch.pose import Pose, generators
 
@@ -100,3 +102,34 @@ def test_a_surface_seen_from_behind_explains_no_point():
     outside = AlignmentTarget(surfaces, 0.1, -toward_the_room).sums(points, Pose.identity(2, 1))
     assert float(inside.n_explained[0]) > 45
     assert float(outside.n_explained[0]) == 0
+
+
+def test_main_normals_are_those_of_most_flat_area_and_apart():
+    """A floor in two parts, a wall, a smaller wall at 20° to it, and a thick blob that does not count."""
+    frame = Pose.from_turn(torch.tensor([0.3, -0.2, 0.5]).double()).rotation
+    turned = Pose.from_turn(torch.tensor([0, 0, math.radians(20)]).double()).rotation
+    floor, wall, blob = (torch.tensor(v).double() for v in ([4, 4, 1e-4], [1e-4, 3, 1], [9, 9, 2.0]))
+    bases = [torch.eye(3).double()] * 3 + [turned, torch.eye(3).double()]
+    shapes = [
+        basis @ v.diag() @ basis.T
+        for basis, v in zip(bases, [floor, floor, wall, wall / 2, blob], strict=True)
+    ]
+    covariances = frame @ torch.stack(shapes) @ frame.T
+    found = main_normals(Parameters(torch.ones(5) / 5, torch.zeros(5, 3).double(), covariances))
+    assert (found @ frame).abs().round(decimals=9).tolist() == [[0, 0, 1], [1, 0, 0]]
+    only_blob = Parameters(torch.ones(1), torch.zeros(1, 3).double(), covariances[4:])
+    assert main_normals(only_blob).shape == (0, 3)
+
+
+def test_everywhere_turns_each_axis_to_its_target_with_all_headings():
+    generator = torch.Generator().manual_seed(0)
+    places = torch.randn(3, 3, generator=generator).double()
+    axes, targets = torch.nn.functional.normalize(torch.randn(2, 4, 3, generator=generator).double(), dim=2)
+    starts = everywhere(places, 1.0, axes, targets)
+    n = len(starts) // 12
+    rotations = starts.rotation.view(3, 4, n, 3, 3)
+    assert torch.allclose(rotations @ axes[:, None, :, None], targets[:, None, :, None].expand(3, 4, n, 3, 1))
+    assert torch.allclose(rotations.det(), torch.ones(()).double())
+    step = Pose(rotations[0, :, 1] @ rotations[0, :, 0].mT, torch.zeros(4, 3).double())
+    assert torch.allclose(step.angle(), torch.tensor(2 * math.pi / n).double())
+    assert torch.equal(starts.translation.view(3, -1, 3), places[:, None].expand(3, 4 * n, 3))

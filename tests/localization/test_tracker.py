@@ -11,7 +11,7 @@ from torch import Tensor
 import gmmtorch as gt
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.localization import Tracker, clock_faults, locate_scans
-from gmmtorch.pose import generators
+from gmmtorch.pose import Pose, generators
 
 
 def in_sensor_frame(scan: gt.Scan, pose: Tensor) -> Tensor:
@@ -85,6 +85,25 @@ def test_scans_without_a_pose_are_found_right_or_not_at_all(building):
         n_found += found.found
         assert not found.found or errors(found.pose, truth)[0] < 0.1, number
     assert n_found >= 11  # of 12
+
+
+def test_a_tilted_or_turned_sensor_in_space_is_found_without_a_pose():
+    """The scans of every fifth place, with the sensor tilted, on its side and upside down."""
+    scans = gt.datasets.load("synthetic_building", n_scans=20)
+    m = gt.GaussianMap()
+    for number, scan in enumerate(scans):
+        if number % 5:
+            m.insert(scan)
+    tracker = Tracker(m)
+    turns = torch.tensor([[0.0, 0, 0], [0.4, 0.2, 0], [0, math.pi / 2, 1], [math.pi, 0, 0]]).double()
+    for number, turn in zip(range(0, 20, 5), turns, strict=True):
+        truth = scans.pose(number) @ Pose.from_turn(turn).matrix
+        tracker.restart()
+        found = tracker.locate(in_sensor_frame(scans[number], truth))
+        distance, angle = errors(found.pose, truth)
+        assert found.found, (number, found.doubts)
+        assert distance < 0.1, number
+        assert angle < 1, number
 
 
 def test_a_scan_of_another_place_is_not_found(building):
