@@ -88,15 +88,15 @@ def test_scans_without_a_pose_are_found_right_or_not_at_all(building):
 
 
 def test_a_tilted_or_turned_sensor_in_space_is_found_without_a_pose():
-    """The scans of every fifth place, with the sensor tilted, on its side and upside down."""
-    scans = gt.datasets.load("synthetic_building", n_scans=20)
+    """Held-out scans, with the sensor upright, tilted, on its side and upside down."""
+    scans = gt.datasets.load("synthetic_building", n_scans=30)
     m = gt.GaussianMap()
     for number, scan in enumerate(scans):
         if number % 5:
             m.insert(scan)
     tracker = Tracker(m)
     turns = torch.tensor([[0.0, 0, 0], [0.4, 0.2, 0], [0, math.pi / 2, 1], [math.pi, 0, 0]]).double()
-    for number, turn in zip(range(0, 20, 5), turns, strict=True):
+    for number, turn in zip((5, 10, 15, 20), turns, strict=True):
         truth = scans.pose(number) @ Pose.from_turn(turn).matrix
         tracker.restart()
         found = tracker.locate(in_sensor_frame(scans[number], truth))
