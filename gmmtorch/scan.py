@@ -86,6 +86,7 @@ def extent(rows: Tensor) -> str:
 
 COLOUR = "colour"
 """Name of the channel with linear RGB from 0 to 1."""
+INTENSITY = "intensity"
 LARGEST_LABEL = 65535
 MOST_CHANNELS, MOST_COLUMNS, LONGEST_NAME = 16, 8, 64
 LARGEST_VALUE = 1e12
