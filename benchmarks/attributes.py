@@ -40,7 +40,7 @@ COLOUR_POSE = "1 0 0 -0.0275\n0 1 0 -0.004\n0 0 1 0\n0 0 0 1\n"
 PLACE_BYTES = 6
 CELL = {"kinect": 0.05, "building": 0.1, "courtyard": 0.2}
 BUDGETS: dict[str, tuple[int | None, ...]]
-BUDGETS = {"kinect": (8000, 16_000, None), "building": (8000,), "courtyard": (16_000, None)}
+BUDGETS = {"kinect": (8000, 16_000, 32_000, None), "building": (8000,), "courtyard": (16_000, None)}
 
 
 def kinect(data: Path) -> list[Scan]:

@@ -86,6 +86,7 @@ def extent(rows: Tensor) -> str:
 
 COLOUR = "colour"
 """Name of the channel with linear RGB from 0 to 1."""
+INTENSITY = "intensity"
 LARGEST_LABEL = 65535
 MOST_CHANNELS, MOST_COLUMNS, LONGEST_NAME = 16, 8, 64
 LARGEST_VALUE = 1e12
@@ -134,11 +135,12 @@ def _as_channel(name: str, given: ArrayLike, points: Tensor) -> Tensor:
         raise InvalidArgumentError(
             f"{where} has {value.shape[1]} columns; give 1 to {MOST_COLUMNS}, in several channels if need be."
         )
-    if is_colour and bool(((value < 0) | (value > 1)).any()):
-        raise InvalidArgumentError(
-            f"{where} has values outside 0 to 1; give linear RGB, or sRGB from 0 to 255 as uint8."
-        )
-    if bool((value.abs() > LARGEST_VALUE).any()):
+    if is_colour:
+        if bool(((value < 0) | (value > 1)).any()):
+            raise InvalidArgumentError(
+                f"{where} has values outside 0 to 1; give linear RGB, or sRGB from 0 to 255 as uint8."
+            )
+    elif bool((value.abs() > LARGEST_VALUE).any()):
         raise InvalidArgumentError(
             f"{where} has values beyond {LARGEST_VALUE:g}, or infinite ones; give them in another unit, and "
             "NaN where unknown."

@@ -33,13 +33,13 @@ from gmmtorch.datasets.base import (
     number_rows,
     require_path,
 )
-from gmmtorch.datasets.point_files.channels import CLASS, INTENSITY, check_channels, read_channels
+from gmmtorch.datasets.point_files.channels import CLASS, check_channels, read_channels
 from gmmtorch.datasets.point_files.pcd_files import pcd_header
 from gmmtorch.datasets.point_files.point_chunks import read_cloud
 from gmmtorch.datasets.trajectory import Trajectory, kitti_poses, read_rows, read_trajectory, to_nanoseconds
 from gmmtorch.errors import DAMAGED_CONTENT, DataError, InvalidArgumentError
 from gmmtorch.pose import Pose
-from gmmtorch.scan import Scan
+from gmmtorch.scan import INTENSITY, Scan
 
 
 class _CloudFiles(Dataset):

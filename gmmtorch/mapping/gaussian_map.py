@@ -36,7 +36,7 @@ from gmmtorch.mapping.query import Block, Query
 from gmmtorch.mapping.query_options import QueryOptions, Sampling, check_method
 from gmmtorch.occupancy import Calibration, Evidence, VoxelGrid, check_queries, check_resolution, check_scan
 from gmmtorch.pose import Pose
-from gmmtorch.scan import Scan, as_time, extent
+from gmmtorch.scan import INTENSITY, Scan, as_time, extent
 
 
 class GaussianMap(MapState):
@@ -179,6 +179,12 @@ class GaussianMap(MapState):
         known = (one.attributes for one in self._pending)
         final = (block.components.attributes.channels for block in self._blocks)
         check_kinds([*final, *known, scan.attributes])
+        values = scan.attributes.get(INTENSITY)
+        if self.learning.reflectivity and values is not None and values.shape[1:] != (1,):
+            raise InvalidArgumentError(
+                'attributes["intensity"] are labels or have several columns; reflectivity=True needs one '
+                "number for each point, in a floating type."
+            )
         self._prepare(scan.dim, scan.points.device, "scan is")
         former = self._query if self._is_asked else None
         self._add(scan.copied(self._device))
@@ -334,16 +340,33 @@ class GaussianMap(MapState):
             )
         return self._answers().evidence(grid, method)
 
-    def attributes(self, points: ArrayLike) -> dict[str, Prediction]:
+    def attributes(self, points: ArrayLike, seen_from: ArrayLike | None = None) -> dict[str, Prediction]:
         """Each channel of the map, such as "colour", at points (M, D) in metres; see `Prediction`.
 
         Unknown where no component is near, and without channels while no scan had any. Differentiable in the
         points; tensors are on their device.
+
+        seen_from: (D,) or (M, D) positions of sensors, whose intensities are predicted instead of the
+            reflectivities that a rule with `reflectivity` learns; those of unknown points stay.
         """
         query = check_queries(points, self.dim)
         if self.dim is None:
             return {}
-        found = predictions(self.components(), query.to(self._device))
+        asked, law, seen = query.to(self._device), self._next_rule.reflectivity, None
+        if seen_from is not None:
+            if isinstance(law, bool):
+                raise InvalidArgumentError(
+                    "seen_from needs a map that learned reflectivities from scans with intensity: give it a "
+                    "rule such as IncrementalRule(reflectivity=True)."
+                )
+            sensors = as_tensor(seen_from, "seen_from", torch.float64, self._device)
+            if sensors.shape not in (asked.shape[1:], asked.shape) or not bool(sensors.isfinite().all()):
+                raise InvalidArgumentError(
+                    f"seen_from has shape {tuple(sensors.shape)}, or is not finite; expected one position "
+                    f"{tuple(asked.shape[1:])} in metres, or one for each point."
+                )
+            seen = law, sensors.expand_as(asked)
+        found = predictions(self.components(), asked, seen=seen)
         return {name: prediction.to(query.device) for name, prediction in found.items()}
 
     def _answers(self) -> Query:
@@ -361,7 +384,7 @@ class GaussianMap(MapState):
     def _file(self, components: Components | None = None) -> bytes:
         """The map's file. `components`: instead of all."""
         found = self.components() if components is None else components
-        return map_bytes(found, self.learning.fitted(self._pending), self.settings, self._next_number)
+        return map_bytes(found, self._next_rule, self.settings, self._next_number)
 
     @property
     def nbytes(self) -> int:

@@ -62,6 +62,7 @@ class MapState(DeviceModule):
         self._doubts = windows.Doubts.none()  # of the final components
         self._next_doubts = self._doubts  # after the pending scans
         self._learned: tuple[Components, int] | None = None  # the last block with those of pending scans
+        self._fitted: LearningRule | None = None  # the rule after the pending scans
         self._parts: dict[tuple[int, int], Components] = {}  # learned from these pending scans
         self._all_rounded: Components | None = None
         self._rounded: list[tuple[Components, Components]] = []  # of each block, and rounded
@@ -148,7 +149,7 @@ class MapState(DeviceModule):
         if not self._pending:
             return self._last, self._next_number
         if self._learned is None:
-            self._learned = self._absorbed(self._pending, self.learning.fitted(self._pending))
+            self._learned = self._absorbed(self._pending, self._next_rule)
             self._is_stale = True  # the query may be of parts of the window
         return self._learned
 
@@ -169,6 +170,13 @@ class MapState(DeviceModule):
                 begin, size = end, 0
         self._parts = found
         return list(found.values())
+
+    @property
+    def _next_rule(self) -> LearningRule:
+        """The rule after the unfinished window."""
+        if self._fitted is None:
+            self._fitted = windows.with_law(self.learning.fitted(self._pending), self._pending)
+        return self._fitted
 
     def _generator(self) -> torch.Generator:
         """Random numbers for the unfinished window."""
@@ -239,7 +247,7 @@ class MapState(DeviceModule):
         `next_number`: of the next new component after those of the last block; None: all are replaced, and it
         is the one after all ids.
         """
-        self.learning = self.learning.fitted(self._pending)
+        self.learning = self._next_rule
         self._doubts = self._next_doubts
         self._n_windows += bool(self._pending)
         self._pending, self._parts = [], {}
@@ -255,7 +263,7 @@ class MapState(DeviceModule):
 
     def _forget(self) -> None:
         """Drops what was computed from the components. The query keeps what the next one can use."""
-        self._learned, self._all_rounded, self._is_stale = None, None, True
+        self._learned, self._all_rounded, self._is_stale, self._fitted = None, None, True, None
 
     # -- torch ----------------------------------------------------------------------------------------
 

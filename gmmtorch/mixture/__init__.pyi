@@ -8,6 +8,7 @@ from .em.exact import SOFTMAX_DTYPES as SOFTMAX_DTYPES
 from .em.exact import Parameters as Parameters
 from .em.exact import maximization as maximization
 from .em.exact import most_likely_component as most_likely_component
+from .em.exact import quadratic_features as quadratic_features
 from .em.exact import shift_features as shift_features
 from .em.initialization import INITIALIZATIONS as INITIALIZATIONS
 from .em.initialization import initialize as initialize

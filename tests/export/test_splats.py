@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from mapping.random_components import random_components
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 import gmmtorch as gt
@@ -97,6 +98,25 @@ def test_other_readers_find_the_places_and_colours(tmp_path, suffix):
     atol = 1e-5 if suffix == ".ply" else 0.5 / 255 / 0.15 * C0 + 1e-5
     np.testing.assert_allclose(0.5 + C0 * cloud.f_dc.numpy(), shades, atol=atol)
     np.testing.assert_allclose(cloud.opacity.numpy()[:, 0], np.log(0.95 / 0.05), atol=0.03)
+
+
+def test_plyfile_reads_every_property_of_splats(tmp_path):
+    plyfile = pytest.importorskip("plyfile")
+    c = coloured()
+    file = plyfile.PlyData.read(write_splats(tmp_path / "map.ply", Splats.of(c)))
+    (table,) = file.elements
+    assert (table.name, table.count, file.byte_order, file.text) == ("vertex", 30, "<", False)
+
+    def columns(*names: str) -> np.ndarray:
+        return np.stack([table[name].astype(np.float64) for name in names], 1)
+
+    np.testing.assert_allclose(columns("x", "y", "z"), c.means, atol=1e-6)
+    shades = display_colours(c.attributes.channels["colour"].mean)
+    np.testing.assert_allclose(0.5 + C0 * columns("f_dc_0", "f_dc_1", "f_dc_2"), shades, atol=1e-6)
+    deviations = np.exp(columns("scale_0", "scale_1", "scale_2"))
+    turn = Rotation.from_quat(columns("rot_1", "rot_2", "rot_3", "rot_0")).as_matrix()
+    root = turn * deviations[:, None]
+    np.testing.assert_allclose(root @ root.transpose(0, 2, 1), c.covariances, rtol=1e-4, atol=1e-6)
 
 
 def test_a_map_without_surfaces_is_written_where_the_format_allows_it(tmp_path):

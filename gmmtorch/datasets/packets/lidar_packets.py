@@ -12,12 +12,12 @@ import torch
 
 from gmmtorch.datasets.packets import hesai, ouster
 from gmmtorch.datasets.packets.sweeps import VELODYNE_BYTES
-from gmmtorch.datasets.point_files.channels import INTENSITY
 from gmmtorch.datasets.ros.bag_reader import BagReader
 from gmmtorch.datasets.ros.sensor_messages import Reading, reading
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.optional_packages import needs_extra
+from gmmtorch.scan import INTENSITY
 
 
 class LidarPackets:

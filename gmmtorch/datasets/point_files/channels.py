@@ -17,9 +17,9 @@ from gmmtorch.datasets.point_files.mesh_files import ply_fields, ply_rows
 from gmmtorch.datasets.point_files.pcd_files import pcd_fields, pcd_rows
 from gmmtorch.datasets.point_files.point_rows import PACKED, Rows
 from gmmtorch.errors import DataError, InvalidArgumentError
-from gmmtorch.scan import COLOUR, LARGEST_LABEL, linear_colours
+from gmmtorch.scan import COLOUR, INTENSITY, LARGEST_LABEL, linear_colours
 
-CLASS, INTENSITY = "class", "intensity"
+CLASS = "class"
 _NAMES: dict[str, tuple[str, ...]] = {
     CLASS: ("class", "label", "classification", "semantic", "scalar_label", "scalar_classification"),
     INTENSITY: ("intensity", "reflectivity", "reflectance", "i", "scalar_intensity"),

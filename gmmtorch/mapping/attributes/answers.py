@@ -10,10 +10,12 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping.attributes.moments import Channel, Labels, overall
+from gmmtorch.mapping.attributes.reflectivity import gain
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import box_around, portions
+from gmmtorch.mapping.learning.rules import IntensityLaw
 from gmmtorch.occupancy import whitening
-from gmmtorch.scan import COLOUR
+from gmmtorch.scan import COLOUR, INTENSITY
 
 CUTOFF = 4.0
 """Mahalanobis distance from a component up to which it predicts."""
@@ -48,12 +50,18 @@ class Prediction(NamedTuple):
         return torch.where(self.known, self.labels[self.mean.argmax(1)], -1)
 
 
-def predictions(components: Components, points: Tensor, cutoff: float = CUTOFF) -> dict[str, Prediction]:
+def predictions(
+    components: Components,
+    points: Tensor,
+    cutoff: float = CUTOFF,
+    seen: tuple[IntensityLaw, Tensor] | None = None,
+) -> dict[str, Prediction]:
     """Each channel of the components at points (M, D), float64, on their device. Differentiable.
 
     The surface components within `cutoff` deviations of a point predict it, weighted by
     support · share · N(x; μ, Σ); the variance is that of the mixture of their predictions. Memory does not
-    grow with the number of pairs of points and components.
+    grow with the number of pairs of points and components. seen: the law of intensities, and the positions
+    (M, D) of the sensors that measure them; None: reflectivities as they are.
     """
     if not components.attributes:
         return {}
@@ -76,7 +84,11 @@ def predictions(components: Components, points: Tensor, cutoff: float = CUTOFF) 
         offset = offset * (_FARTHEST_SLOPE / length).clamp_max(1)[..., None]
         order.append(part)
         for name, channel in channels.items():
-            found[name].append(_mixed(channel, some, weight, offset))
+            factor = None
+            if seen is not None and name == INTENSITY:
+                rays = (asked - seen[1][inside])[part, None].expand_as(offset)
+                factor = gain(seen[0], rays, white[some])
+            found[name].append(_mixed(channel, some, weight, offset, factor))
     rows = inside[torch.cat(order)] if order else inside
     return {
         name: _placed(name, channel, solid.support, found[name], rows, points)
@@ -84,9 +96,11 @@ def predictions(components: Components, points: Tensor, cutoff: float = CUTOFF) 
     }
 
 
-def _mixed(channel: Channel, some: Tensor, weight: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and variance (n, A) of the mixture of the predictions of some components, and their total weight
-    (n,), for weight (n, J) and offset (n, J, D) from their means."""
+def _mixed(
+    channel: Channel, some: Tensor, weight: Tensor, offset: Tensor, factor: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and variance (n, A) of the mixture of the predictions of some components, times `factor` (n, J),
+    and their total weight (n,), for weight (n, J) and offset (n, J, D) from their means."""
     if isinstance(channel, Labels):
         total = weight @ channel.share[some].sum(1)
         mean = (weight @ channel.share[some]) / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]
@@ -96,9 +110,10 @@ def _mixed(channel: Channel, some: Tensor, weight: Tensor, offset: Tensor) -> tu
     share = weight / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]
     own = channel.mean[some] + torch.einsum("kad,nkd->nka", channel.slope[some], offset)
     noise = channel.covariance[some].diagonal(dim1=1, dim2=2)
+    own, scaled = (own, share) if factor is None else (own * factor[..., None], share * factor.square())
     mean = torch.einsum("nk,nka->na", share, own)
     spread = torch.einsum("nk,nka->na", share, (own - mean[:, None]).square())
-    return mean, spread + share @ noise, total
+    return mean, spread + scaled @ noise, total
 
 
 def _placed(

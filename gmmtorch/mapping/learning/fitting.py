@@ -21,9 +21,10 @@ from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.kernels import DepthCells, DepthViews, cell_features, depth_cells, range_sums
 from gmmtorch.linalg import as_tensors, on_cpu
 from gmmtorch.mapping.attributes.moments import Attributes, learned, of_scans
+from gmmtorch.mapping.attributes.reflectivity import gain
 from gmmtorch.mapping.components import UNNUMBERED, Components
 from gmmtorch.mapping.learning.merging import AssignedViewpoints, AssignViewpoints
-from gmmtorch.mapping.learning.rules import MixtureRule
+from gmmtorch.mapping.learning.rules import IntensityLaw, MixtureRule
 from gmmtorch.mixture import (
     Cells,
     FlatnessRule,
@@ -39,9 +40,10 @@ from gmmtorch.mixture import (
     run_em,
     shift_features,
 )
+from gmmtorch.occupancy import whitening
 from gmmtorch.pinhole import check_intrinsics, metric_depth
 from gmmtorch.pose import Pose
-from gmmtorch.scan import Scan
+from gmmtorch.scan import INTENSITY, Scan
 
 if TYPE_CHECKING:
     from gmmtorch.mixture import SensorModel
@@ -342,7 +344,12 @@ def fit_points(
     found, counts, n_learned, cells, owner = learn(window, replace(fit, rule=rule))
     known = None
     if any(attributes):
-        known = learned(of_scans(attributes, sizes), cells, owner, found.means, found.covariances)
+        channels = of_scans(attributes, sizes)
+        if isinstance(rule.reflectivity, IntensityLaw) and INTENSITY in channels:
+            white, place = whitening(found.covariances), owner[cells.member]
+            seen = gain(rule.reflectivity, window.points - window.origins[scan], white[0][place])
+            channels[INTENSITY] = channels[INTENSITY] / seen[:, None]
+        known = learned(channels, cells, owner, found.means, found.covariances)
     found = found._replace(means=found.means + center)
     counts, origins, *parts = on_cpu(counts, origins, *found)
     found, known = Parameters(*parts), Attributes() if known is None else known.on_cpu()

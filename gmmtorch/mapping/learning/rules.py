@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 from gmmtorch.declarations import option
 from gmmtorch.errors import (
@@ -65,6 +66,40 @@ class NoveltyRule:
             check_number("explained", self.explained, above=True)
 
 
+class IntensityLaw(NamedTuple):
+    """How intensities depend on range and incidence, see `attributes.reflectivity`; estimated from n beams.
+
+    reference: the range (m) of reflectivities. rr to ii: sums of squares and products within components of
+        the logarithms of range (r), cosine of the incidence (c) and intensity (i).
+    """
+
+    reference: float
+    n: float
+    rr: float
+    rc: float
+    cc: float
+    ri: float
+    ci: float
+    ii: float
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether all values are finite numbers, and the range is above 0."""
+        return all(isinstance(x, float | int) and math.isfinite(x) for x in self) and self.reference > 0
+
+    @property
+    def exponents(self) -> tuple[float, float]:
+        """Of the range and of the cosine. Least squares with a normal prior of deviation 2, the size of those
+        of a small target (−4, 0) and of a matt surface (−2, 1); it counts where beams do not tell them apart.
+        """
+        prior = self.ii / (4 * max(self.n, 1))
+        rr, cc = self.rr + prior, self.cc + prior
+        area = rr * cc - self.rc**2
+        if not area > 0:
+            return 0.0, 0.0
+        return (cc * self.ri - self.rc * self.ci) / area, (rr * self.ci - self.rc * self.ri) / area
+
+
 @dataclass(frozen=True, kw_only=True)
 class MixtureRule(PruneOptions):
     """How the mixture of a window is learned. Components of no-return beams are not pruned.
@@ -75,12 +110,15 @@ class MixtureRule(PruneOptions):
         variances (2.9). None: it does not split a node that is at most as thick as a flat piece.
     free_points: number of points at equal distances on each beam with a return, from which components of free
         space are learned, as from the ends of no-return beams (thesis 3.5).
+    reflectivity: True: the channel "intensity" of the map is the reflectivity, by a law of range and
+        incidence that is estimated from all windows so far; the law is then the value. False: as measured.
     """
 
     prune: Prune = "none"
     learner: LearnerName = "flat_pieces"
     planarity: float | None = None
     free_points: int = 0
+    reflectivity: bool | IntensityLaw = False
     forget: int | float | str = option(
         FORGET_OFF,
         "what leaves the map. off: nothing; contradiction: surfaces that later beams pass through; a number: "
@@ -93,6 +131,11 @@ class MixtureRule(PruneOptions):
         if self.planarity is not None:
             check_number("planarity", self.planarity, largest=1.0, above=True)
         check_whole("free_points", self.free_points, 0)
+        law = self.reflectivity
+        if not isinstance(law, bool) and not (isinstance(law, IntensityLaw) and law.is_valid):
+            raise InvalidArgumentError(
+                f"reflectivity={law!r}: give True or False, or the law of another map."
+            )
         if self.forget is False:  # YAML reads `off` as False
             object.__setattr__(self, "forget", FORGET_OFF)
         if isinstance(self.forget, str | bool):
@@ -252,6 +295,8 @@ def read_rule(kind: str, novelty: dict[str, Any] | None = None, **options: Any) 
     """The rule of given `rule_facts`. Raises `KeyError`, `TypeError` or `ValueError` for other facts."""
     if novelty is not None:
         options["novelty"] = NoveltyRule(**novelty)
+    if isinstance(options.get("reflectivity"), list | tuple):
+        options["reflectivity"] = IntensityLaw(*options["reflectivity"])
     return _RULES[kind](**options)
 
 

@@ -34,6 +34,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import PassLimits, beam_passes, few_points_evidence, is_fused
+from gmmtorch.mapping.attributes.reflectivity import estimated
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning import merging
 from gmmtorch.mapping.learning.fitting import (
@@ -54,9 +55,16 @@ from gmmtorch.mapping.learning.rules import (
     WindowedRule,
 )
 from gmmtorch.mapping.query import Block, boxes_of, cutoff_for
-from gmmtorch.mixture import SOFTMAX_DTYPES, FlatnessRule, surface_rule
+from gmmtorch.mixture import (
+    SOFTMAX_DTYPES,
+    FlatnessRule,
+    Parameters,
+    most_likely_component,
+    quadratic_features,
+    surface_rule,
+)
 from gmmtorch.occupancy import Calibrator, Cones, Prediction, few_point_evidence, spectrum_of, whitening
-from gmmtorch.scan import Scan
+from gmmtorch.scan import INTENSITY, Scan
 
 BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
 """Is called with the components of a map before a window, and the window."""
@@ -199,6 +207,29 @@ def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Gener
     quick = replace(rule, window_components=max(1, rule.window_components // 2))
     learned = _learned(scans, quick, 1.0, 0).to(scans[0].points.device)
     return merging.limit_origins(learned, rule.max_origins, rule.mean_origins)
+
+
+_LAW_POINTS = 50_000  # of a window, from which the law of intensities is estimated
+
+
+def with_law(rule: LearningRule, scans: Sequence[Scan]) -> LearningRule:
+    """The rule with the law of intensities after some scans, estimated within their flat pieces."""
+    scans = [scan for scan in scans if INTENSITY in scan.attributes and len(scan.points)]
+    if not rule.reflectivity or not scans:
+        return rule
+    step = 1 + sum(len(scan.points) for scan in scans) // _LAW_POINTS
+    some = [Scan(scan.points[::step].double(), scan.origin) for scan in scans]
+    pieces = learn_part(some, replace(rule, reflectivity=False), torch.Generator().manual_seed(0))
+    pieces = pieces.to(some[0].points.device)
+    points = torch.cat([one.points for one in some])
+    rays = points - torch.cat([one.origin.double().expand_as(one.points) for one in some])
+    values = torch.cat([scan.attributes[INTENSITY][::step, 0] for scan in scans])
+    center, shares = points.mean(0), pieces.support / pieces.support.sum()
+    mixture = Parameters(shares, pieces.means - center, pieces.covariances)
+    owner = most_likely_component(quadratic_features(points - center), mixture)
+    law = None if isinstance(rule.reflectivity, bool) else rule.reflectivity
+    law = estimated(law, rays, whitening(pieces.covariances)[0][owner], owner, values)
+    return rule if law is None else replace(rule, reflectivity=law)
 
 
 def learns_in_parts(rule: LearningRule) -> bool:
