@@ -256,7 +256,7 @@ class SharedMap:
         received = radio.receive(now)
         radio.keep([item.datagram for item in received if replica.receive(item.datagram, item.message)])
         datagrams = radio.within_budget(lambda budget: replica.datagrams(budget=budget), now)
-        if radio.announcements.due(now, (replica.version,), urgent=bool(replica.missing)):
+        if radio.announcements.due(now, (replica.version,), bool(replica.missing), replica.is_complete):
             datagrams += replica.announcements()
         radio.send(datagrams, now)
 
