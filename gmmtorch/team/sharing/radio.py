@@ -95,7 +95,7 @@ class Radio:
 
     Args:
         robot: its id. transport: the network.
-        announce_every: seconds between announcements while there is news.
+        announce_every: seconds between announcements while records are missing.
         budget: bytes per second for records and views; None: no limit.
         decode: turns a datagram into a message, or raises `DataError`.
 

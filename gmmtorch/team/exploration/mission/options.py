@@ -203,7 +203,9 @@ class TeamOptions(LinkConditions):
     rest: StoppingRule = field(default_factory=StoppingRule)
     codec: str = _CODEC
     announce_every: float = option(
-        10.0, "seconds between announcements of a robot's records, while these change", "network.announce"
+        10.0,
+        "seconds between announcements of a robot's records while some are missing; else four times as long",
+        "network.announce",
     )
     budget: float | None = option(
         None,
