@@ -251,6 +251,7 @@ def test_a_plan_is_sent_unless_no_teammate_can_be_near() -> None:
     hear(one, post, (2, plan_datagram(10, -30.0, sender=2)), now=12.0)
     fly(one, 12.0, 6, rests=False)
     fly(one, 60.0, 7, rests=False)  # it may have flown 80 m since
+    fly(one, 61.0, 70, rests=False)  # but knows since a second ago where this robot is, and is silent
     for number, behind in ((11, 7.0), (12, 4.0)):  # out of the range of a camera, and within it
         x = float(one.robot.position[0]) - behind
         hear(one, post, (2, plan_datagram(number, x, sender=2)), now=40.0 + 2 * number)

@@ -249,6 +249,7 @@ class Agent:
         self.heard_at: dict[int, float] = {}
         self._places: dict[int, tuple[float, Tensor]] = {}  # where teammates were, (N, 3), and when
         self._newest: dict[int, int] = {}  # sequence of the newest component of each teammate
+        self._told_at, self._has_new = -math.inf, False  # when it said where it is; whether components do
         self.refused: Counter[str] = Counter()
         self._evaluator, self._primitives = evaluator, primitives
         self._waiting = Waiting(primitives, _PATIENCE)
@@ -295,6 +296,7 @@ class Agent:
         """Learns from a frame, and sends what is due of the map."""
         with self.watch("mapping"):
             update = self.robot.sense(frame)
+        self._has_new |= bool(update.evidence)
         with self.watch("sharing"):
             self.send_map(now)
         return update
@@ -314,6 +316,8 @@ class Agent:
         if self.radio.announcements.due(now, (shared.version,), bool(shared.missing), shared.is_complete):
             datagrams += shared.announcements()
         self.radio.send(datagrams, now)
+        if datagrams and self._has_new:
+            self._told_at, self._has_new = max(self._told_at, self._seen_at(now)), False
 
     def send_views(self, now: float) -> None:
         """Sends views every `_VIEWS_EVERY` seconds, if the map leaves enough of the budget."""
@@ -368,7 +372,11 @@ class Agent:
         if is_teammate and sequence > self._newest.get(sender, -1):
             self._newest[sender] = sequence
             origins = components.origins[components.seen_from[components.seen_by == newest]]
-            self._places[sender] = now - _MAP_EVERY * self.options.dynamics.duration, origins.double()
+            self._places[sender] = self._seen_at(now), origins.double()
+
+    def _seen_at(self, now: float) -> float:
+        """When the newest of the components that are sent now was seen, at the earliest."""
+        return now - _MAP_EVERY * self.options.dynamics.duration
 
     # -- planning ---------------------------------------------------------------------------------
 
@@ -440,11 +448,13 @@ class Agent:
             if len(path) % 2 == 0:
                 path, step = path[1::2], 2 * step  # a path is interpolated
             self.radio.send(encode_plan(self.number, number, now, step, path, views), now)
+            self._told_at = now
 
     def _is_far(self, places: Tensor, now: float) -> bool:
         """Whether places (N, 3) of a plan are out of the range of a camera from all teammates, wherever these
         have flown since their last plans and components; and farther than two robots fly until the next plan.
-        So what both may see is little, and no paths cross."""
+        So what both may see is little, and no paths cross. A teammate that was told later where this robot is
+        knows better than this robot whether it is near, and sends its plan if so."""
         options = self.options
         speed = math.hypot(options.dynamics.speed, options.dynamics.climb)
         reach = max(options.camera.max_range, 2 * speed * options.dynamics.duration)
@@ -452,7 +462,7 @@ class Agent:
             return False
         for then, theirs in self._places.values():
             apart = torch.cdist(places.double(), theirs).amin().item() if len(theirs) else 0.0
-            if apart <= reach + speed * max(0.0, now - then):
+            if apart <= reach + speed * max(0.0, now - max(then, self._told_at)):
                 return False
         return True
 
