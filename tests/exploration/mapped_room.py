@@ -43,12 +43,13 @@ def mapper(
     novelty: NoveltyRule = NOVELTY,
     **options: Any,
 ) -> GmmMapper:
-    """One with a `Replica`, or with a `Broadcast` in a codec."""
+    """One with a `Replica`, or with a `Broadcast` in a codec; it counts every ten frames, as flights here are
+    short."""
     local = RollingWindow(0.2, (64, 64, 32))
     local.center_on(torch.tensor([4.0, 3.0, 1.5], dtype=torch.float64))
     belief = BeliefMap(0.2, BOX, torch.ones(BOX.shape, dtype=torch.bool), BeliefRule())
     shared = Replica(robot, dim=3, incarnation=0) if codec == "replica" else Broadcast(robot, codec)
-    team = TeamOptions(camera=CAMERA, novelty=novelty, frame=FrameRule(**options))
+    team = TeamOptions(camera=CAMERA, novelty=novelty, frame=FrameRule(**{"update_every": 10, **options}))
     return GmmMapper(local, belief, team, Memo(256) if memo is None else memo, shared)
 
 

@@ -28,7 +28,12 @@ from gmmtorch.team.exploration.robot.mapper import GridMapper, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.sharing.messages.component_messages import encode_components
 from gmmtorch.team.sharing.messages.message_registry import decode, kind_of
-from gmmtorch.team.sharing.messages.mission_messages import PlanMessage, encode_plan, quantized_poses
+from gmmtorch.team.sharing.messages.mission_messages import (
+    PlanMessage,
+    encode_plan,
+    quantized_poses,
+    quantized_views,
+)
 from gmmtorch.team.sharing.replica.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
@@ -246,7 +251,31 @@ def test_a_plan_is_sent_unless_no_teammate_can_be_near() -> None:
     hear(one, post, (2, plan_datagram(10, -30.0, sender=2)), now=12.0)
     fly(one, 12.0, 6, rests=False)
     fly(one, 60.0, 7, rests=False)  # it may have flown 80 m since
-    assert [decode(datagram).number for _, datagram in post.of("plans")] == [0, 5, 7]
+    fly(one, 61.0, 70, rests=False)  # but knows since a second ago where this robot is, and is silent
+    for number, behind in ((11, 7.0), (12, 4.0)):  # out of the range of a camera, and within it
+        x = float(one.robot.position[0]) - behind
+        hear(one, post, (2, plan_datagram(number, x, sender=2)), now=40.0 + 2 * number)
+        fly(one, 40.0 + 2 * number, number - 3, rests=False)
+    assert [decode(datagram).number for _, datagram in post.of("plans")] == [0, 5, 7, 9]
+
+
+def test_components_show_where_a_teammate_is_unless_they_are_old_or_of_another_robot() -> None:
+    one, post = agent()
+    other, far = Replica(2, incarnation=0), Replica(1, incarnation=0)
+    for replica, x in ((far, 500.0), (other, 0.0), (other, -500.0)):
+        made = random_components(3, k=4, seed=3)
+        replica.add(replace(made, origins=made.origins * 0 + torch.tensor([x, 0.0, 0.0])))
+        for datagram in replica.datagrams():
+            hear(one, post, (replica.robot, datagram), now=0.0)
+            hear(one, post, (1, datagram), now=0.0)  # relayed
+    fly(one, 0.0, 0, rests=False)
+    hear(one, post, *((2, datagram) for datagram in other.datagrams()), now=2.0)
+    old = encode_components(other.components().selected(torch.arange(4)))
+    hear(one, post, *((2, datagram) for datagram in old), now=2.0)
+    fly(one, 2.0, 1, rests=False)
+    assert post.of("plans") == []
+    fly(one, 400.0, 2, rests=False)  # they may be anywhere by now
+    assert len(post.of("plans")) == 1
 
 
 def test_a_plan_has_every_second_pose_and_the_views_after_the_path() -> None:
@@ -260,7 +289,8 @@ def test_a_plan_has_every_second_pose_and_the_views_after_the_path() -> None:
     assert plan is not None
     assert said.step == pytest.approx(2 * one.options.dynamics.step)
     assert torch.equal(said.path, quantized_poses(plan.path[1::2, :4]))
-    assert torch.equal(torch.cat([said.path[-1:], said.views]), quantized_poses(plan.views))
+    assert torch.equal(said.views, quantized_views(plan.views[1:]))
+    assert torch.equal(said.path[-1], quantized_poses(plan.views[:1])[0])
 
 
 def test_a_resting_robot_sends_one_plan_in_ten() -> None:
@@ -286,20 +316,20 @@ def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
 # -- what it sends ----------------------------------------------------------------------------------------
 
 
-def test_views_are_sent_every_twenty_seconds_and_after_the_clock_was_set_back() -> None:
+def test_views_are_sent_every_forty_seconds_and_after_the_clock_was_set_back() -> None:
     one, post = agent()
-    for second in (0.0, 2.0, 19.0, 20.0, 22.0, 3.0):
+    for second in (0.0, 2.0, 39.0, 40.0, 42.0, 3.0):
         place = torch.tensor([[100.0 * second, 0.0, 0.0, 0.0]], dtype=torch.float64)
         one.robot.library.add(place, torch.ones(1), second, 0.0)
         one.send_views(second)
-    assert [now for now, _ in post.of("views")] == [0.0, 20.0, 3.0]
+    assert [now for now, _ in post.of("views")] == [0.0, 40.0, 3.0]
     assert sum(len(decode(datagram).ids) for _, datagram in post.of("views")) == 6
 
 
 @pytest.mark.parametrize("kind", MAPS)
 def test_datagrams_are_sent_under_their_kind(kind: str) -> None:
     one, post = agent(2, kind, announce_every=1.0)
-    for seed in range(10):
+    for seed in range(20):
         for place in PLACES[:2]:
             one.learn(frame(*place, seed=seed), float(seed))
     one.robot.library.add(views(2).poses, torch.ones(2), 1.0, 0.0)
@@ -356,11 +386,11 @@ def test_views_use_what_the_map_leaves_of_the_budget() -> None:
 
 def test_announcements_ignore_the_budget_and_become_rare() -> None:
     one, post = agent(budget=1e-3, announce_every=2.0)
-    assert one.radio.within_budget(lambda budget: [bytes(1000)], 0.0)  # of the 1200 bytes at the start
+    assert one.radio.within_budget(lambda budget: [bytes(1100)], 0.0)  # of the 1200 bytes at the start
     for seed, place in enumerate(PLACES):
         one.robot.sense(frame(*place, seed=seed))
     for tick in range(40):
         one.send_map(float(tick))
     assert sum(len(datagram) for _, datagram in post.of("components")) <= 200
     assert one.robot.mapper.shared.datagrams()  # the rest is still due
-    assert sorted({now for now, _ in post.of("announcements")}) == [2.0, 6.0, 14.0, 30.0]
+    assert sorted({now for now, _ in post.of("announcements")}) == [2.0, 10.0, 26.0]

@@ -31,7 +31,7 @@ EARLIER = {
         "0addb3f5c4392b357e04ea6ac417ebf7",
     ),
     "version 4": (
-        "1js-L003H@U&oTT@<w`y7c9>c$-4dbWrO;bcxM)ziZW0JP%FmcrWOtp#D2>kIlG|Jd#n-J+pdww){iEje4X}5LaT(H!|)j",
+        "1js-L003H@U&oTT@<_dXhKR#iac+}q)Pj1Qw}$Km^NRUOKRyhfn!<<R>FOS?0&gGH@%5^k{@C=?yC@F(uF<P?T7l5)eb=!",
         "bba5c28e77a767b9c90e00f1991439ca",
     ),
 }

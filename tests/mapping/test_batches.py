@@ -45,10 +45,12 @@ def sealed(body: bytes) -> bytes:
     return body + zlib.crc32(body).to_bytes(4, "little")
 
 
-@pytest.fixture(scope="module", params=["fine", "coarse", "around a sensor"])
+@pytest.fixture(scope="module", params=["fine", "coarse", "around a sensor", "frames of a sensor"])
 def sound(request) -> bytes:
     if request.param == "around a sensor":
         return encode(around_a_sensor(12))
+    if request.param == "frames of a sensor":
+        return encode(Components.concatenate(frames_of_a_sensor(2)).selected(torch.arange(18, 30)))
     return encode(quantized(random_components(3, k=12), coarse=request.param == "coarse"))
 
 
@@ -206,6 +208,52 @@ def test_ends_of_beams_of_one_length_take_fewer_bytes_around_their_sensor():
     """What the sphere tells: the same components, seen from elsewhere."""
     made = around_a_sensor(60)
     assert len(encode(made)) + 40 < len(encode(replace(made, origins=made.origins + 40.0)))
+
+
+def frames_of_a_sensor(n: int) -> list[Components]:
+    """Frames of a sensor that moves by a quarter of a metre, numbered in a row."""
+    made = around_a_sensor(24)
+    moved = [made.means + 0.25 * i for i in range(n)]
+    return [
+        quantized(
+            replace(made, means=at, origins=made.origins + 0.25 * i, ids=made.ids + 24 * i), coarse=True
+        )
+        for i, at in enumerate(moved)
+    ]
+
+
+def test_frames_of_a_sensor_take_fewer_bytes_in_one_batch():
+    """Also if the sensor returns to a place, and if a component has no viewpoint, or two."""
+    frames = frames_of_a_sensor(4)
+    both = Components.concatenate(frames)
+    assert len(encode(both)) + 3 * 12 < sum(len(encode(frame)) for frame in frames)
+    back = replace(both, seen_from=both.seen_from.flip(0))
+    for odd in (
+        both,
+        back,
+        replace(both, **without_viewpoint_of(both, 30)),
+        replace(both, **seen_twice(both, 40)),
+    ):
+        made = quantized(odd, coarse=True)
+        twin, fused = by_both(lambda made=made: encode(made))
+        assert twin == fused
+        for found in by_both(lambda fused=fused: decode(fused)):
+            assert_same_components(found, made)
+
+
+def without_viewpoint_of(c: Components, row: int) -> dict[str, torch.Tensor]:
+    kept = c.seen_by != row
+    return {name: getattr(c, name)[kept] for name in ("seen_by", "seen_from", "seen_count")}
+
+
+def seen_twice(c: Components, row: int) -> dict[str, torch.Tensor]:
+    first = c.seen_from[c.seen_by == row]
+    other = (first + 1) % len(c.origins)
+    return {
+        "seen_by": torch.cat([c.seen_by, torch.tensor([row])]),
+        "seen_from": torch.cat([c.seen_from, other]),
+        "seen_count": torch.cat([c.seen_count, c.seen_count[c.seen_by == row]]),
+    }
 
 
 @settings(max_examples=80)

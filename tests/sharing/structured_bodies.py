@@ -299,14 +299,18 @@ def _views(rng: Random) -> bytes:
 
 def _plan(rng: Random) -> bytes:
     writer = BitWriter()
-    for usual in (1, 7, 5000, 200):
+    for usual in (1, 7, 200):
         _number(writer, rng, usual)
     n = _number(writer, rng, rng.choice([_size(rng), 1000, 1001]))
-    for axis in range(4 if n else 0):
-        _number(writer, rng, rng.randrange(256 if axis == 3 else 5000))
+    n_views = _number(writer, rng, _size(rng))
+    _number(writer, rng, rng.choice([0, 5000]))
+    for _ in range(3 if n else 0):
+        _number(writer, rng, rng.randrange(5000))
+    if n:
+        writer.one(rng.randrange(256), 8)
     _moves(writer, rng, min(n - 1, 1))
     _moves(writer, rng, n - 2)
-    _moves(writer, rng, _number(writer, rng, _size(rng)))
+    _moves(writer, rng, n_views)
     return writer.to_bytes()
 
 

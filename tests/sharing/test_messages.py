@@ -33,6 +33,7 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     encode_points,
     encode_views,
     quantized_poses,
+    quantized_views,
 )
 from gmmtorch.team.sharing.replica.record_keys import Intervals
 
@@ -370,14 +371,19 @@ def test_plans_are_decoded_within_their_step(sender, number, time, step, n, n_vi
     assert isinstance(found, PlanMessage)
     assert (found.sender, found.number, found.time, found.step) == (sender, number, time / 1000, step / 1000)
     assert torch.equal(found.path, quantized_poses(path))
-    assert torch.equal(found.views, views(n_views).poses)
+    assert torch.equal(found.views, quantized_views(views(n_views).poses))
+    apart = found.views - quantized_poses(views(n_views).poses)
+    assert bool((apart[:, :3].abs() <= 0.05 + 1e-9).all())
+    turn = torch.atan2(apart[:, 3].sin(), apart[:, 3].cos()).abs()
+    assert bool((turn <= math.pi / 32 + 1e-9).all())
+    assert encode_plan(sender, number, time / 1000, step / 1000, found.path, found.views) == [datagram]
 
 
 def test_a_plan_of_four_seconds_is_short():
     along = torch.arange(20, dtype=torch.float64) * 0.2
     path = torch.stack([along.cos() * 3, along.sin() * 3, 1 + 0.1 * along, along + math.pi / 2], 1)
-    assert len(encode_plan(1, 17, 842.0, 0.2, path)[0]) <= 60
-    assert len(encode_plan(1, 17, 842.0, 0.4, path[1::2])[0]) <= 46
+    assert len(encode_plan(1, 17, 68.0, 0.2, path)[0]) <= 56
+    assert len(encode_plan(1, 17, 68.0, 0.4, path[1::2])[0]) <= 43
 
 
 def test_invalid_plans_are_refused():
@@ -416,12 +422,12 @@ def test_a_counts_message_equals_bytes_by_hand():
 def test_a_path_message_equals_bytes_by_hand():
     """Two poses of robot 0, a metre apart, the second turned right by 45°; no views."""
     poses = torch.tensor([[0.0, 0.01, 0.0, 0.0], [1.0, 0.01, 0.0, -math.pi / 4]], dtype=torch.float64)
-    stream = "".join(f"{byte:08b}" for byte in (0, 2, 2, 4, 4))  # robot 0, plan 1, 1 ms, 2 ms, 2 poses
+    # Robot 0, plan 1, poses 2 ms apart, 2 poses, no views; after 1 ms, and plan 1 is expected after 4 ms.
+    stream = "".join(f"{byte:08b}" for byte in (0, 2, 4, 4, 0, 5))
     stream += "00000000" + "00000010" + "00000000" + "00000000"  # the first pose; 1 = 2 zigzag
     for low, moves in ((6, (200, 0)), (4, (0, 63))):  # 100 along x, -32 of 256 in yaw; zigzag
         stream += f"{low:06b}" + "".join("0" * (move >> low) + "1" for move in moves)
         stream += "".join(f"{move % (1 << low):0{low}b}" for move in moves)
-    stream += "00000000"  # no views
     stream += "0" * (-len(stream) % 8)
     datagram = sealed(b"\x29" + int(stream, 2).to_bytes(len(stream) // 8, "big"))
     assert encode_plan(0, 1, 0.001, 0.002, poses) == [datagram]

@@ -32,6 +32,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
     encode_record,
     keys_in,
 )
+from gmmtorch.team.sharing.radio import AnnouncementSchedule
 from gmmtorch.team.sharing.replica.anti_entropy import MOST_PEERS, Backlog
 from gmmtorch.team.sharing.replica.materialized_view import Counters
 from gmmtorch.team.sharing.replica.record_keys import END, Intervals, evict, first_key, keys_of
@@ -431,6 +432,30 @@ def test_a_late_robot_receives_all_records_from_a_third_robot():
     for datagram in late.announcements():
         relay.receive(datagram)
     assert relay.datagrams() == []
+
+
+def test_a_later_record_shows_that_an_earlier_one_was_lost():
+    one, other = Replica(0, incarnation=5), Replica(1, incarnation=9)
+    assert other.is_complete
+    sent = []
+    for seed in range(2):
+        one.add(random_components(3, k=5, seed=seed))
+        sent += one.datagrams()
+    assert other.receive(sent[1])
+    assert not other.is_complete
+    assert other.receive(sent[0])
+    assert other.is_complete
+
+
+def test_a_robot_that_lacks_no_record_announces_every_fourth_period_while_records_change():
+    for complete, urgent, expected in (
+        (True, False, [10, 50, 90, 130]),
+        (False, False, [*range(10, 140, 10)]),
+        (True, True, [*range(10, 140, 10)]),
+    ):
+        schedule = AnnouncementSchedule(10.0)
+        said = [now for now in range(140) if schedule.due(float(now), (now,), urgent, complete)]
+        assert said == expected
 
 
 def test_replicas_with_equal_records_send_only_announcements():

@@ -3,67 +3,10 @@
 #pragma once
 
 #include "../mixtures/lattice.h"
+#include "coded_batch.h"
 #include "range_coder.h"
 
 namespace gmm {
-
-// The K components, S origins and E viewpoints of a batch, as in `Quantized`. cells: side 2^side m. coarse: 0
-// or 1.
-struct Batch {
-    int64_t k;
-    int64_t n_origins;
-    int64_t n_seen;
-    int64_t side;
-    int64_t coarse;
-    int64_t* axis_order;
-    int64_t* deviation;
-    int64_t* shear;
-    int64_t* mean;
-    int64_t* count;
-    int64_t* max_range;
-    int64_t* ids;
-    int64_t* origins;
-    int64_t* n_viewpoints;
-    int64_t* seen_from;
-    int64_t* share;
-};
-
-// Scratch: leaf (S,): the origins in the order of the tree; box (T, 2, D): of its T items; distance, item
-// (T,): of the heap; row (S,): zeros; place, normal, cell (K, D).
-struct Scratch {
-    int64_t* leaf;
-    int64_t* box;
-    double* distance;
-    int64_t* waiting;
-    int64_t* row;
-    double* place;
-    double* normal;
-    int64_t* cell;
-};
-
-struct Field {
-    enum {
-        FLAG,
-        LEVEL,
-        DIGIT,
-        LOWER,
-        ORDER,
-        WIDE,
-        RATIO,
-        THIN,
-        TURN,
-        TILT,
-        SLOPE,
-        ACROSS,
-        COUNT,
-        VIEWS,
-        RANK,
-        SHARE,
-        ORIGIN,
-        ROBOT,
-        NUMBER
-    };
-};
 
 // Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
 template <int DIM, bool WRITES>
@@ -76,8 +19,9 @@ struct Walk {
     int64_t offset, nearest;
     int64_t level_begin[24], n_waiting, work;  // of the tree of origins and its heap; items taken from it
     int levels;
-    bool is_slow, is_round;   // whether the component is near a sphere around the only origin
+    bool is_slow, is_round;   // whether the component is near a sphere around its only origin
     double eye[DIM], radius;  // of that sphere; 0: not known
+    int64_t eye_at;           // that origin's index, or that of the component before
 
     GMM_INLINE int64_t slots(int field, int64_t context, int64_t size = 32) const {
         return c.s.first_slot[field] + context * size;
@@ -333,13 +277,38 @@ struct Walk {
         }
     }
 
-    GMM_INLINE void component(int64_t i) {
+    GMM_INLINE void look_from(int64_t origin) {
+        eye_at = origin;
+        for (int a = 0; a < DIM; ++a)
+            eye[a] = origin < b.n_origins ? (double)b.origins[origin * DIM + a] * 0.00390625 : 0.0;
+    }
+
+    // Whether component i has one viewpoint, which begins at `begin`, and then which: most often that of the
+    // component before.
+    GMM_INLINE bool only_eye(int64_t i, int64_t begin) {
+        if (!b.coarse || b.n_origins == 0 || begin >= b.n_seen) return false;
+        const int64_t n = b.n_origins, seen = WRITES ? b.seen_from[begin] : 0;
+        const bool one = WRITES && b.n_viewpoints[i] == 1;
+        check(seen >= 0 && seen < n);
+        if (!c.good) return false;
+        if (!c.bit(slots(Field::EYE, 0), one && seen == eye_at)) {
+            if (!c.bit(slots(Field::EYE, 0) + 1, one)) return false;
+            const int64_t ahead = c.number(slots(Field::EYE, 1), (seen - eye_at - 1 + n) % n);
+            check(ahead < n - 1);
+            if (!c.good) return false;
+            look_from((eye_at + 1 + ahead) % n);
+        }
+        b.n_viewpoints[i] = 1, b.seen_from[begin] = eye_at, b.share[begin] = 0;
+        return true;
+    }
+
+    GMM_INLINE void component(int64_t i, bool has_eye) {
         int64_t flag = b.max_range[i], k;
         int64_t& j = nearest;
         const int64_t last = i > 0 ? b.max_range[i - 1] : 0;
         flag = c.bit(slots(Field::FLAG, 2 * last + (i > 1 ? b.max_range[i - 2] : 0), 1), flag);
         b.max_range[i] = flag;
-        is_round = DIM == 3 && b.coarse && flag && b.n_origins == 1;
+        is_round = DIM == 3 && flag && has_eye;
         cell(i, flag);
         if (!c.good) return;
         const double apart = neighbours(i, j, k);
@@ -580,12 +549,13 @@ struct Walk {
         for (int64_t i = 0; i < b.k && c.good; ++i) id(i);
         for (int64_t i = 0; i < b.n_origins && c.good; ++i) origin(i);
         is_round = false, radius = 0.0;
-        for (int a = 0; a < DIM; ++a) eye[a] = b.n_origins > 0 ? (double)b.origins[a] * 0.00390625 : 0.0;
+        look_from(0);
         if (c.good) grow_tree();
         int64_t seen = 0;
         for (int64_t i = 0; i < b.k && c.good; ++i) {
-            component(i);
-            if (c.good) seen = viewpoints(i, nearest, seen);
+            const bool has_eye = only_eye(i, seen);
+            if (c.good) component(i, has_eye);
+            if (c.good) seen = has_eye ? seen + 1 : viewpoints(i, nearest, seen);
         }
         check(seen == b.n_seen);
         return is_slow ? -2 : c.end();

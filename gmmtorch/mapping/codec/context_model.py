@@ -54,8 +54,9 @@ FIELDS = {
     "ORIGIN": (6, NUMBER),
     "ROBOT": (2, NUMBER),
     "NUMBER": (2, NUMBER),
+    "EYE": (2, NUMBER),
 }
-"""Contexts of each field, and slots of each context."""
+"""Contexts of each field, and slots of each context; the last one is of coarse batches."""
 _OF_SPHERES = {"TILT": 14, "SLOPE": 21, "ACROSS": 8}
 """Further contexts in coarse batches."""
 
@@ -101,7 +102,8 @@ def read_batch(batch: CodedBatch, data: bytes) -> None:
 def first_tables(coarse: bool) -> ChanceTables:
     """The tables before the first bit."""
     more = _OF_SPHERES if coarse else {}
-    sizes = [(contexts + more.get(name, 0)) * slots for name, (contexts, slots) in FIELDS.items()]
+    fields = list(FIELDS.items())[: len(FIELDS) if coarse else -1]
+    sizes = [(contexts + more.get(name, 0)) * slots for name, (contexts, slots) in fields]
     return first_chances(OF_COARSE if coarse else CHANCES, sizes)
 
 
@@ -115,7 +117,7 @@ class _Walk:
     """
 
     def __init__(self, coder: RangeCoder, batch: CodedBatch) -> None:
-        self._first = dict(zip(FIELDS, coder.first, strict=True))
+        self._first = dict(zip(FIELDS, coder.first, strict=False))
         self.c, self.b, self.dim, self.side = coder, batch, batch.dim, batch.side
         self.places, self.normals = np.zeros(batch.mean.shape), np.zeros(batch.mean.shape)
         self.offset = offset_of(self.side)
@@ -124,8 +126,8 @@ class _Walk:
             name: value.tolist() for name, value in vars(batch).items() if isinstance(value, np.ndarray)
         }
         self.last, self.unit = self.dim - 1, 1 + batch.coarse
-        self.eye = [0.0] * self.dim
-        self.is_round = False  # whether the component is near a sphere around the only origin
+        self.eye, self.eye_at = [0.0] * self.dim, 0  # the last only origin of a component, and its index
+        self.is_round = False  # whether the component is near a sphere around its only origin
         self.radius = 0.0  # of that sphere; 0: not known
 
     def run(self) -> None:
@@ -135,11 +137,12 @@ class _Walk:
         for i in range(len(v["origins"])):
             self._origin(i)
         self._origins = np.array(v["origins"], np.float64).reshape(-1, self.dim) * ORIGIN_STEP
-        self.eye = self._origins[0].tolist() if len(self._origins) else [0.0] * self.dim
+        self._look_from(0)
         begin = 0
         for i in range(len(v["count"])):
-            near = self._component(i)
-            begin = self._viewpoints(i, near, begin)
+            has_eye = self._only_eye(i, begin)
+            near = self._component(i, has_eye)
+            begin = begin + 1 if has_eye else self._viewpoints(i, near, begin)
         _require(begin == len(v["seen_from"]))
         if not self.c.writes:
             for name, values in v.items():
@@ -253,13 +256,36 @@ class _Walk:
         _require(max(d) <= LARGEST_DEVIATION and min(d) >= LEAST_DEVIATION and d == sorted(d, reverse=True))
         _require(d[0] - d[last] <= LARGEST_RATIO)
 
-    def _component(self, i: int) -> int:
-        """Code a component; returns its nearest neighbour."""
+    def _look_from(self, origin: int) -> None:
+        self.eye_at = origin
+        if origin < len(self._origins):
+            self.eye = self._origins[origin].tolist()
+
+    def _only_eye(self, i: int, begin: int) -> bool:
+        """Code whether component i has one viewpoint, `begin`, and then which: most often that of the
+        component before."""
+        c, v, n = self.c, self.v, len(self.v["origins"])
+        if not self.b.coarse or n == 0 or begin >= len(v["seen_from"]):
+            return False
+        seen = v["seen_from"][begin] if c.writes else 0
+        is_one = c.writes and v["n_viewpoints"][i] == 1
+        slot = self._slots("EYE", 0)
+        if not c.bit(slot, int(is_one and seen == self.eye_at)):
+            if not c.bit(slot + 1, int(is_one)):
+                return False
+            ahead = c.number(self._slots("EYE", 1), (seen - self.eye_at - 1) % n)
+            _require(ahead < n - 1)
+            self._look_from((self.eye_at + 1 + ahead) % n)
+        v["n_viewpoints"][i], v["seen_from"][begin], v["share"][begin] = 1, self.eye_at, 0
+        return True
+
+    def _component(self, i: int, has_eye: bool) -> int:
+        """Code a component; returns its nearest neighbour. has_eye: whether it has one viewpoint."""
         c, v, last = self.c, self.v, self.last
         flags, orders = v["max_range"], v["axis_order"]
         before = 2 * (flags[i - 1] if i > 0 else 0) + (flags[i - 2] if i > 1 else 0)
         flag = flags[i] = c.bit(self._slots("FLAG", before, 1), flags[i])
-        self.is_round = self.dim == 3 and self.b.coarse and flag == 1 and len(v["origins"]) == 1
+        self.is_round = self.dim == 3 and flag == 1 and has_eye
         self._cell(i, flag)
         j, k, apart = self._neighbours(i)
         context = (flag * 2 + (orders[j] == orders[k])) * 6 + orders[j] if i > 0 else 24 + flag

@@ -1,5 +1,6 @@
 from .broadcast import Broadcast as Broadcast
 from .broadcast import SharedPoints as SharedPoints
+from .messages.component_messages import ComponentsMessage as ComponentsMessage
 from .messages.datagrams import MAX_BYTES as MAX_BYTES
 from .messages.datagrams import check_codec as check_codec
 from .messages.message_registry import Message as Message

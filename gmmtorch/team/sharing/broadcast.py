@@ -36,6 +36,7 @@ class SendOnce:
 
     version = 0
     held = missing = Intervals.empty()
+    is_complete, waits = True, False
 
     def __init__(self) -> None:
         self._due: list[bytes] = []

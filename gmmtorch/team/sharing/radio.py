@@ -42,6 +42,9 @@ class TokenBucket:
 
 
 _LONGEST_PAUSE = 16  # announcement periods between two announcements of the same content, at most
+_COMPLETE_PAUSE = 4
+"""Announcement periods between those of a robot that knows of no record that it lacks, after its first. They
+only show others its last records: that earlier ones were lost, later records show."""
 
 
 class ReceivedMessage(NamedTuple):
@@ -53,9 +56,9 @@ class ReceivedMessage(NamedTuple):
 
 
 class AnnouncementSchedule:
-    """When a robot announces which records it holds: every `period` (s) while they change or some are
-    missing. A lost announcement must be repeated, but a team at rest would send little else. So the pause
-    doubles after each announcement without news, up to 16 periods."""
+    """When a robot announces which records it holds: every `period` (s) while some are missing, and every
+    fourth period while they only change. A lost announcement must be repeated, but a team at rest would send
+    little else. So the pause doubles after each announcement without news, up to 16 periods."""
 
     def __init__(self, period: float) -> None:
         if not 0 < period < math.inf:
@@ -63,23 +66,27 @@ class AnnouncementSchedule:
         self._period = self._pause = float(period)
         self._last: float | None = None
         self._announced: tuple[int, ...] | None = None
+        self._has_announced = False
 
-    def due(self, now: float, content: tuple[int, ...], urgent: bool = False) -> bool:
+    def due(self, now: float, content: tuple[int, ...], urgent: bool = False, complete: bool = False) -> bool:
         """Whether to announce at the time `now` (s). If so, the caller must announce.
 
         The first call starts the first period, and so does a clock that was set back.
 
-        content: changes whenever what is announced changes. urgent: whether records are missing.
+        content: changes whenever what is announced changes. urgent: whether others announced records that are
+        missing. complete: whether no record is missing before those that are held.
         """
         if self._last is None or now < self._last:
             self._last, self._announced, self._pause = now, content, self._period
             return False
         is_old = content == self._announced and not urgent
-        pause = self._pause if is_old else self._period
+        is_calm = complete and not urgent and self._has_announced
+        fresh = self._period * (_COMPLETE_PAUSE if is_calm else 1)
+        pause = max(self._pause, fresh) if is_old else fresh
         if now - self._last < pause - 1e-9:
             return False
         self._pause = min(2 * pause, _LONGEST_PAUSE * self._period) if is_old else self._period
-        self._last, self._announced = now, content
+        self._last, self._announced, self._has_announced = now, content, True
         return True
 
 
@@ -88,7 +95,7 @@ class Radio:
 
     Args:
         robot: its id. transport: the network.
-        announce_every: seconds between announcements while there is news.
+        announce_every: seconds between announcements while records are missing.
         budget: bytes per second for records and views; None: no limit.
         decode: turns a datagram into a message, or raises `DataError`.
 

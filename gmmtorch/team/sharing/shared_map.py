@@ -202,7 +202,7 @@ class SharedMap:
     Args:
         replica: of this robot; nothing else may add components to it. transport: the network.
         store: keeps records before they are sent; it has restored the replica. None: nothing is kept.
-        announce_every: seconds between announcements while there is news.
+        announce_every: seconds between announcements while records are missing.
         budget: bytes per second for records; None: no limit.
         joiner: of a replica with a frame of its own. It searches for this frame's place in a teammate's.
 
@@ -256,7 +256,7 @@ class SharedMap:
         received = radio.receive(now)
         radio.keep([item.datagram for item in received if replica.receive(item.datagram, item.message)])
         datagrams = radio.within_budget(lambda budget: replica.datagrams(budget=budget), now)
-        if radio.announcements.due(now, (replica.version,), urgent=bool(replica.missing)):
+        if radio.announcements.due(now, (replica.version,), bool(replica.missing), replica.is_complete):
             datagrams += replica.announcements()
         radio.send(datagrams, now)
 

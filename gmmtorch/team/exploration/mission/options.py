@@ -115,7 +115,7 @@ class FrameRule:
     update_novel: bool = False
     update_stride: int | None = 11
     update_at: float = 3.0
-    update_every: int = 10
+    update_every: int = 30
 
     def __post_init__(self) -> None:
         for name in ("side", "noise", "length", "cell"):
@@ -203,7 +203,9 @@ class TeamOptions(LinkConditions):
     rest: StoppingRule = field(default_factory=StoppingRule)
     codec: str = _CODEC
     announce_every: float = option(
-        10.0, "seconds between announcements of a robot's records, while these change", "network.announce"
+        10.0,
+        "seconds between announcements of a robot's records while some are missing; else four times as long",
+        "network.announce",
     )
     budget: float | None = option(
         None,

@@ -9,6 +9,7 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
+from gmmtorch.mapping import Components
 from gmmtorch.simulation import DepthFrame, MeshWorld
 from gmmtorch.team.exploration.mission.driver import Stopwatch
 from gmmtorch.team.exploration.mission.options import StoppingRule, TeamOptions
@@ -28,6 +29,7 @@ from gmmtorch.team.exploration.robot.mapper import FrameUpdate, Mapper, Memo
 from gmmtorch.team.exploration.world.starts import InitialFreeSpace
 from gmmtorch.team.sharing import (
     MAX_BYTES,
+    ComponentsMessage,
     PlanMessage,
     Radio,
     Store,
@@ -210,7 +212,8 @@ class Robot:
 _SEEDS_PER_MISSION = 1 << 10  # robot ids for which the random draws differ
 _LATEST_PLANS = 10  # A plan whose number is lower than the last one's by more comes from a restarted robot
 _RESTING_PLANS = 10  # plans of a robot at rest, of which one is sent
-_VIEWS_EVERY = 20.0  # seconds between messages of views: many change or are removed before they are sent
+_MAP_EVERY = 1  # planning periods between messages of a map: components of few frames share a datagram
+_VIEWS_EVERY = 40.0  # seconds between messages of views: many change or are removed before they are sent
 _PATIENCE = 15
 """Consecutive plans without progress after which a robot looks around. Leaving a start takes up to six."""
 
@@ -244,6 +247,9 @@ class Agent:
             robot.number, transport, options.announce_every, options.budget, decode=memo.decoded
         )
         self.heard_at: dict[int, float] = {}
+        self._places: dict[int, tuple[float, Tensor]] = {}  # where teammates were, (N, 3), and when
+        self._newest: dict[int, int] = {}  # sequence of the newest component of each teammate
+        self._told_at, self._has_new = -math.inf, False  # when it said where it is; whether components do
         self.refused: Counter[str] = Counter()
         self._evaluator, self._primitives = evaluator, primitives
         self._waiting = Waiting(primitives, _PATIENCE)
@@ -254,7 +260,7 @@ class Agent:
         self._rests = False
         self._seen_from: tuple[Tensor, tuple[Tensor, Tensor]] | None = None  # the last pose, and its beams
         self._plan: Plan | None = None
-        self._views_at = -math.inf  # when views were sent last
+        self._views_at = self._map_at = -math.inf  # when views, and records of the map, were sent last
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
         self._n_unsent = 0  # plans at that pose since
 
@@ -290,6 +296,7 @@ class Agent:
         """Learns from a frame, and sends what is due of the map."""
         with self.watch("mapping"):
             update = self.robot.sense(frame)
+        self._has_new |= bool(update.evidence)
         with self.watch("sharing"):
             self.send_map(now)
         return update
@@ -297,15 +304,20 @@ class Agent:
     # -- messages ---------------------------------------------------------------------------------
 
     def send_map(self, now: float) -> None:
-        """Sends what is due of the map, and announcements if they are due."""
-        if not self.options.shares:
-            return
+        """Sends what is due of the map, and announcements if they are due; less than a datagram every
+        `_MAP_EVERY` planning periods only."""
         shared = self.robot.mapper.shared
+        sends_at = self._map_at + _MAP_EVERY * self.options.dynamics.duration - 1e-9
+        is_early = self._map_at <= now < sends_at  # if not, the clock was perhaps set back
+        if not self.options.shares or (is_early and shared.waits):
+            return
+        self._map_at = now
         datagrams = self.radio.within_budget(lambda budget: shared.datagrams(budget=budget), now)
-        urgent = bool(shared.missing)
-        if self.radio.announcements.due(now, (shared.version,), urgent):
+        if self.radio.announcements.due(now, (shared.version,), bool(shared.missing), shared.is_complete):
             datagrams += shared.announcements()
         self.radio.send(datagrams, now)
+        if datagrams and self._has_new:
+            self._told_at, self._has_new = max(self._told_at, self._seen_at(now)), False
 
     def send_views(self, now: float) -> None:
         """Sends views every `_VIEWS_EVERY` seconds, if the map leaves enough of the budget."""
@@ -328,6 +340,8 @@ class Agent:
                 self._note_plan(item.sender, item.message, now)
             elif isinstance(item.message, ViewsMessage):
                 self.robot.library.receive(item.message, now)
+            elif isinstance(item.message, ComponentsMessage):
+                self._note_place(item.sender, item.message.components, now)
         with self.watch("mapping"):
             merged = self.robot.mapper.receive(
                 [item for item in received if not isinstance(item.message, PlanMessage | ViewsMessage)]
@@ -348,6 +362,21 @@ class Agent:
                 return
         self.robot.plans[sender] = plan
         self.heard_at[sender] = now
+        self._places[sender] = now, torch.cat([plan.path, plan.views])[:, :3].double()
+
+    def _note_place(self, sender: int, components: Components, now: float) -> None:
+        """Stores from where a teammate has seen its newest component, which it may have held back."""
+        newest = int(components.ids[:, 1].argmax())
+        robot, sequence = components.ids[newest].tolist()
+        is_teammate = robot == sender != self.number and sender < self.options.size
+        if is_teammate and sequence > self._newest.get(sender, -1):
+            self._newest[sender] = sequence
+            origins = components.origins[components.seen_from[components.seen_by == newest]]
+            self._places[sender] = self._seen_at(now), origins.double()
+
+    def _seen_at(self, now: float) -> float:
+        """When the newest of the components that are sent now was seen, at the earliest."""
+        return now - _MAP_EVERY * self.options.dynamics.duration
 
     # -- planning ---------------------------------------------------------------------------------
 
@@ -419,18 +448,21 @@ class Agent:
             if len(path) % 2 == 0:
                 path, step = path[1::2], 2 * step  # a path is interpolated
             self.radio.send(encode_plan(self.number, number, now, step, path, views), now)
+            self._told_at = now
 
     def _is_far(self, places: Tensor, now: float) -> bool:
-        """Whether places (N, 3) of a plan are so far from all teammates that no camera sees the same from
-        both, wherever these have flown since their last plans."""
-        options, heard = self.options, self.robot.plans
-        if len(heard) < options.size - 1:
+        """Whether places (N, 3) of a plan are out of the range of a camera from all teammates, wherever these
+        have flown since their last plans and components; and farther than two robots fly until the next plan.
+        So what both may see is little, and no paths cross. A teammate that was told later where this robot is
+        knows better than this robot whether it is near, and sends its plan if so."""
+        options = self.options
+        speed = math.hypot(options.dynamics.speed, options.dynamics.climb)
+        reach = max(options.camera.max_range, 2 * speed * options.dynamics.duration)
+        if len(self._places) < options.size - 1:
             return False
-        for number, plan in heard.items():
-            theirs = torch.cat([plan.path, plan.views])[:, :3].double()
+        for then, theirs in self._places.values():
             apart = torch.cdist(places.double(), theirs).amin().item() if len(theirs) else 0.0
-            flown = math.hypot(options.dynamics.speed, options.dynamics.climb) * (now - self.heard_at[number])
-            if apart <= 2 * options.camera.max_range + max(0.0, flown):
+            if apart <= reach + speed * max(0.0, now - max(then, self._told_at)):
                 return False
         return True
 

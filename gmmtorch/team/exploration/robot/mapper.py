@@ -414,7 +414,7 @@ class GmmMapper(Mapper):
         if changes.rebuilt:
             self._rebuild()
             return []
-        batches = [*changes.added, changes.gained]
+        batches = [*itertools.chain(*map(_frames, changes.added)), changes.gained]
         return [self._enter(batch) for batch in batches if len(batch)]
 
     def _rebuild(self) -> None:
@@ -437,6 +437,18 @@ class GmmMapper(Mapper):
         evidence = self._memo(_key(batch), lambda: component_evidence(there, grid.box, self._rays))
         self._add(evidence)
         return evidence
+
+
+def _frames(batch: Components) -> list[Components]:
+    """The components of each frame of a batch, as their robot learned them, so that their evidence is cached.
+    A component of several frames is in the last one."""
+    if len(batch.origins) < 2:
+        return [batch]
+    seen_from = batch.seen_from.new_zeros(len(batch)).scatter_(0, batch.seen_by, batch.seen_from)
+    return [
+        batch.selected((seen_from == origin).nonzero().squeeze(1)).with_used_origins()
+        for origin in torch.unique(seen_from)
+    ]
 
 
 def _key(batch: Components) -> bytes:

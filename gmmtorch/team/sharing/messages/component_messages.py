@@ -105,7 +105,7 @@ def fitted(
     number is estimated from the datagram before, which takes fewer attempts than halving. channels: whether
     they have their attributes."""
     _check_viewpoints(values.n_viewpoints)
-    _check_quantized(values)
+    check_quantized(values)
     so_far = values.n_viewpoints.cumsum(0)
     begin, n = 0, _FIRST_GUESS
     while begin < len(values):
@@ -130,7 +130,7 @@ def fitted(
 
 def _quantized(components: Components) -> bytes:
     values = quantize(components)
-    _check_quantized(values)
+    check_quantized(values)
     return make_datagram(Kind.COMPONENTS, encode_quantized(values, bool(values.attributes.present())))
 
 
@@ -245,7 +245,8 @@ def _check_viewpoints(viewpoints: Tensor) -> None:
         )
 
 
-def _check_quantized(values: Quantized) -> None:
+def check_quantized(values: Quantized) -> None:
+    """Raise `InvalidArgumentError` if positions or ids are out of range."""
     means = scaled(values.places.mean, values.places.mean_exponents())
     _check_range(means, values.origins.double() * ORIGIN_STEP, values.ids)
 

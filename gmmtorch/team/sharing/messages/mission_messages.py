@@ -112,6 +112,11 @@ STEPS_PER_METRE = 100
 """Positions are whole centimetres."""
 YAW_STEPS = 256
 """Steps of a full turn."""
+VIEW_YAW_STEPS = 32
+"""Those of the views of a plan, whose positions are whole decimetres, because their information is that of
+the nearest pose of a coarser lattice."""
+_YAW_BITS = 8
+_COARSER = np.array([10] * 3 + [YAW_STEPS // VIEW_YAW_STEPS])
 TICKS, STAMP_TICKS = 1000, 10
 """Times of plans are whole milliseconds; stamps of views are whole tenths of a second."""
 LATEST = 1e9
@@ -141,7 +146,7 @@ class PlanMessage:
     """Plan number `number` of robot `sender`.
 
     path (S, 4): poses at time, time + step, time + 2 step, … (s); the robot is at rest at the last one.
-    views (V, 4): camera poses that the robot will observe from.
+    views (V, 4): camera poses that the robot will observe from, rounded as `quantized_views` does.
     """
 
     sender: int
@@ -209,11 +214,12 @@ def read_views(body: bytes) -> ViewsMessage:
 def encode_plan(
     sender: int, number: int, time: float, step: float, path: Tensor, views: Tensor | None = None
 ) -> list[bytes]:
-    """The datagram of a plan, 1 to 3 bytes per pose of the path, 4 to 5 a view.
+    """The datagram of a plan, 1 to 3 bytes per pose of the path, 2 to 3 a view.
 
-    Poses are rounded to 1 cm and 1/256 of a turn, times to 1 ms.
+    Poses are rounded to 1 cm and 1/256 of a turn, views to 10 cm and 1/32 of a turn, times to 1 ms.
 
-    sender: id of the robot. number: rises with each of its plans. time: (s) of the first pose of the path.
+    sender: id of the robot. number: rises with each of its plans. time: (s) of the first pose of the path; it
+    takes least bytes if the plans before took as long as this one and began at 0.
     step: (s) from each pose to the next, above zero. path: (S, 4). views: (V, 4).
 
     Raises `InvalidArgumentError` if the plan does not fit into a datagram.
@@ -221,21 +227,21 @@ def encode_plan(
     writer = BitWriter()
     write_number(writer, "sender", sender)
     write_number(writer, "number", number)
-    writer.number(int(_ticks("time", torch.tensor([time], dtype=torch.float64))[0]))
-    pace = int(_ticks("step", torch.tensor([step], dtype=torch.float64))[0])
+    start, pace = (
+        int(_ticks(name, torch.tensor([value], dtype=torch.float64))[0])
+        for name, value in (("time", time), ("step", step))
+    )
     if pace < 1:
         raise InvalidArgumentError(f"step={step} must be at least a millisecond.")
     writer.number(pace)
-    last = np.zeros((1, 4), np.int64)
-    for name, poses in (("path", path), ("views", path[:0] if views is None else views)):
+    views = path[:0] if views is None else views
+    for name, poses in (("path", path), ("views", views)):
         if len(poses) > MOST_POSES:
             raise InvalidArgumentError(f"{name} has {len(poses)} poses; {MOST_POSES} are the most.")
         writer.number(len(poses))
-        steps = _pose_steps(name, poses)
-        if name == "path" and len(steps):
-            last = _write_path(writer, steps)
-        else:
-            _write_moves(writer, _moves(np.concatenate([last, steps])))
+    writer.number(start - _expected(number, pace, len(path)))
+    last = _write_path(writer, _pose_steps("path", path))
+    _write_moves(writer, _moves(_coarse(np.concatenate([last, _pose_steps("views", views)])), VIEW_YAW_STEPS))
     datagram = make_datagram(Kind.PLAN, writer.to_bytes())
     if len(datagram) > MAX_BYTES:
         raise InvalidArgumentError(
@@ -248,14 +254,24 @@ def encode_plan(
 def read_plan(body: bytes) -> PlanMessage:
     reader = BitReader(body)
     sender, number = read_number(reader), read_number(reader)
-    time, step = _seconds_of(np.array([reader.number(), reader.number()])).tolist()
-    if not step > 0:
-        raise DataError(f"The poses of a path are {step} s apart: it is damaged.")
-    path = _read_path(reader, _read_size(reader))
-    last = path[-1:] if len(path) else np.zeros((1, 4), np.int64)
-    views = last + np.cumsum(_read_moves(reader, _read_size(reader)), 0)
+    pace, n_path, n_views = reader.number(), _read_size(reader), _read_size(reader)
+    if not 0 < pace <= LATEST * TICKS:
+        raise DataError(f"The poses of a path are {pace} ms apart: it is damaged.")
+    start = reader.number() + _expected(number, pace, n_path)
+    if abs(start) > LATEST * TICKS:
+        raise DataError(f"A plan begins after {start} ms: it is damaged.")
+    path = _read_path(reader, n_path)
+    last = _coarse(path[-1:] if n_path else np.zeros((1, 4), np.int64))
+    views = (last + np.cumsum(_read_moves(reader, n_views), 0)) * _COARSER
     reader.finish()
-    return PlanMessage(sender, number, time, step, _checked_poses(path), _checked_poses(views))
+    seconds = start / TICKS, pace / TICKS
+    return PlanMessage(sender, number, *seconds, _checked_poses(path), _checked_poses(views))
+
+
+def _expected(number: int, pace: int, n_poses: int) -> int:
+    """When a plan begins (ms) if those before it took as long, and the first one began at 0."""
+    expected = number * pace * n_poses
+    return expected if expected <= LATEST * TICKS else 0
 
 
 def _read_size(reader: BitReader) -> int:
@@ -298,6 +314,18 @@ def quantized_poses(poses: Tensor) -> Tensor:
     return _poses(_pose_steps("poses", poses))
 
 
+def quantized_views(poses: Tensor) -> Tensor:
+    """Views (N, 4) as plans round them: to 10 cm and 1/32 of a turn, yaw in [−π, π)."""
+    return _poses(_coarse(_pose_steps("views", poses)) * _COARSER)
+
+
+def _coarse(steps: Ints) -> Ints:
+    """Poses (N, 4) in the steps of the views of a plan."""
+    rounded: Ints = np.rint(steps / _COARSER).astype(np.int64)
+    rounded[:, 3] %= VIEW_YAW_STEPS
+    return rounded
+
+
 def _pose_steps(name: str, poses: Tensor) -> Ints:
     """Poses (N, 4) in steps, yaw from 0 to 255."""
     if poses.ndim != 2 or poses.shape[1] != 4:
@@ -332,9 +360,12 @@ def _read_poses(reader: BitReader, n: int) -> Tensor:
 
 def _write_path(writer: BitWriter, steps: Ints) -> Ints:
     """Write poses (S, 4) of a path: the first pose, the first move, then how each move differs from the one
-    before, which is little. Returns the last pose (1, 4)."""
-    for value in steps[0].tolist():
+    before, which is little. Returns the last pose (1, 4); zeros, if there is none."""
+    if not len(steps):
+        return np.zeros((1, 4), np.int64)
+    for value in steps[0, :3].tolist():
         writer.number(value)
+    writer.one(int(steps[0, 3]), _YAW_BITS)
     moves = _moves(steps)
     _write_moves(writer, moves[:1])
     _write_moves(writer, np.diff(moves, axis=0))
@@ -345,16 +376,17 @@ def _read_path(reader: BitReader, n: int) -> Ints:
     """Poses (n, 4) of a path, in steps."""
     if not n:
         return np.zeros((0, 4), np.int64)
-    first = np.array([[reader.number() for _ in range(4)]], np.int64)
+    first = np.array([[*(reader.number() for _ in range(3)), reader.one(_YAW_BITS)]], np.int64)
     moves = np.cumsum([*_read_moves(reader, min(n - 1, 1)), *_read_moves(reader, max(n - 2, 0))], 0)
     moves = moves.reshape(n - 1, 4)
     return np.concatenate([first, first + np.cumsum(moves, 0)])
 
 
-def _moves(steps: Ints) -> Ints:
-    """The moves (S − 1, 4) from each of poses (S, 4) to the next; the yaw takes the shorter way round."""
+def _moves(steps: Ints, turn: int = YAW_STEPS) -> Ints:
+    """The moves (S − 1, 4) from each of poses (S, 4) to the next; the yaw, of `turn` steps, takes the shorter
+    way round."""
     moves = np.diff(steps, axis=0)
-    moves[:, 3] = (moves[:, 3] + YAW_STEPS // 2) % YAW_STEPS - YAW_STEPS // 2
+    moves[:, 3] = (moves[:, 3] + turn // 2) % turn - turn // 2
     return moves
 
 

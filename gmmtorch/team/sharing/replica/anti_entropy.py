@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -38,12 +38,9 @@ PATIENCE = 1 << 7
 """Announcements made here after which a silent robot counts as gone, with the records that only it announced:
 two minutes if urgent."""
 
-Packet = tuple[bytes, Intervals]
-"""A datagram, and the keys of its records."""
-
 
 class Backlog:
-    """Keys of records that are due, and datagrams of some of them that were encoded before.
+    """Keys of records that are due.
 
     A robot's own records are sent at once to robots that lack them. Records of others are sent if they are
     still lacking in the next announcement, as otherwise all robots would answer at once. Records that were
@@ -55,17 +52,15 @@ class Backlog:
         own = keys_of_robot(robot)
         self._own = Intervals.union([own.shifted(CHANNELS), own])
         self.due = Intervals.empty()
-        self.ready: list[Packet] = []
         self._in_flight = [Intervals.empty()] * _CALLS_IN_FLIGHT  # since the last call of `sent`, and before
         self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others lack, by robot
         self._theirs: OrderedDict[int, Intervals] = OrderedDict()  # what others hold and this robot lacked
         self._waited: dict[int, int] = {}  # announcements made here since those others announced
         self._know_channels: list[int] = []  # robots that announced channels
 
-    def add(self, keys: Intervals, packets: Sequence[Packet] = ()) -> None:
-        """New records; packets: encoded datagrams of some of them."""
+    def add(self, keys: Intervals) -> None:
+        """New records."""
         self.due |= keys
-        self.ready += packets
 
     def received(self, keys: Intervals) -> None:
         """Another robot sent these records, or an echo of this robot's arrived."""
@@ -76,7 +71,6 @@ class Backlog:
         """All records that this robot has sent since the last call."""
         self.due -= keys
         self._in_flight = [keys.up_to(MOST_IN_FLIGHT), *self._in_flight[:-1]]
-        self.ready = [packet for packet in self.ready if self.due.covers(packet[1])]
 
     def announcing(self) -> None:
         """This robot announces what it holds. Robots that did not announce for `PATIENCE` calls are
@@ -114,29 +108,24 @@ class Backlog:
 
 
 _OF_CHANNELS = Intervals.span(CHANNELS, CHANNELS + END)
-_RUN = 160  # components with consecutive keys that are sent together: about one datagram
-_COMPONENT_BYTES = 6  # about, in a datagram
+ABOUT_A_DATAGRAM = 160  # components
+_RUN = 32  # components with consecutive keys whose information is compared
 
 
 def packets(
-    records: Records, due: Intervals, ready: Sequence[Packet], max_bytes: int, by_information: bool
-) -> Iterator[Packet]:
+    records: Records, due: Intervals, max_bytes: int, by_information: bool
+) -> Iterator[tuple[bytes, Intervals]]:
     """Datagrams with the keys of their records: supersessions and corrections, components, then counters.
 
     Args:
         due: keys of records to send, none superseded; keys of channels, for components with channels.
-        ready: encoded components; they are sent unchanged.
         max_bytes: largest size of a datagram.
         by_information: False: components in the order of their keys, which takes the fewest bytes. True: in
-            runs of consecutive keys, the runs with most `_information` for a byte first, which takes few
-            more.
+            runs of consecutive keys, those with most `_information` first, which takes few more.
     """
     due &= records.known
     if not due:
         return
-    ready = [packet for packet in ready if len(packet[0]) <= max_bytes and due.covers(packet[1])]
-    for _, keys in ready:
-        due -= keys
     complete = (due & _OF_CHANNELS).shifted(-CHANNELS)
     due_keys = (due - _OF_CHANNELS - complete).numbers()
     is_component = records.table.contains(due_keys)
@@ -144,33 +133,23 @@ def packets(
     for record in others:
         if not isinstance(record, CountersMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
-    for run in _in_order(records, [due_keys[is_component], complete.numbers()], ready, by_information):
-        if isinstance(run, tuple):
-            yield run
-            continue
-        channels = int(run[0]) in complete
-        for datagram, part in fitted(quantize(records.table.selected(run)), max_bytes, channels):
-            keys = Intervals.of(keys_of(part.ids))
-            yield datagram, keys | keys.shifted(CHANNELS) if channels else keys
+    for numbers, channels in ((due_keys[is_component], False), (complete.numbers(), True)):
+        for some in _in_order(records, numbers, by_information):
+            for datagram, part in fitted(quantize(records.table.selected(some)), max_bytes, channels):
+                keys = Intervals.of(keys_of(part.ids))
+                yield datagram, keys | keys.shifted(CHANNELS) if channels else keys
     for record in others:
         if isinstance(record, CountersMessage):
             yield records.datagrams[record.key], Intervals.span(record.key, record.key + 1)
 
 
-def _in_order(
-    records: Records, groups: Sequence[Ints], ready: Sequence[Packet], by_information: bool
-) -> list[Packet | Ints]:
-    """Ready packets, and runs of the keys of each group, in the order in which they are sent."""
-    runs = [run for keys in groups for run in _runs(keys, _RUN if by_information else None)]
-    found: list[Packet | Ints] = [*ready, *runs]
-    members = [*((packet[1] - _OF_CHANNELS).numbers() for packet in ready), *runs]
-    if by_information:
-        sizes = [*(len(packet[0]) for packet in ready), *(_COMPONENT_BYTES * len(run) for run in runs)]
-        worth = [float(_information(records.table.selected(one)).sum()) for one in members]
-        rank = [-information / size for information, size in zip(worth, sizes, strict=True)]
-    else:
-        rank = [float(one[0]) for one in members]
-    return [found[row] for row in np.argsort(np.array(rank), kind="stable")]
+def _in_order(records: Records, keys: Ints, by_information: bool) -> list[Ints]:
+    """Rising keys (N,) in the parts that are encoded together."""
+    runs = _runs(keys, _RUN if by_information else None)
+    if not by_information or not runs:
+        return runs
+    worth = [float(_information(records.table.selected(run)).mean()) for run in runs]
+    return [np.concatenate([runs[row] for row in np.argsort(-np.array(worth), kind="stable")])]
 
 
 def _information(components: Components) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.mapping import NO_COUNT, Components, order_of, quantize, quantized
 from gmmtorch.occupancy import Calibration
-from gmmtorch.team.sharing.messages.component_messages import fitted
+from gmmtorch.team.sharing.messages.component_messages import check_quantized
 from gmmtorch.team.sharing.messages.datagrams import pose_of, split
 from gmmtorch.team.sharing.messages.message_registry import decode
 from gmmtorch.team.sharing.messages.record_messages import (
@@ -27,7 +27,6 @@ from gmmtorch.team.sharing.messages.record_messages import (
     counters_message,
     encode_record,
 )
-from gmmtorch.team.sharing.replica.anti_entropy import Packet
 from gmmtorch.team.sharing.replica.materialized_view import fingerprints, latest, most_viewpoints
 from gmmtorch.team.sharing.replica.record_keys import (
     MOST_RECORDS,
@@ -89,8 +88,8 @@ _MOST_POINTS = 2.0**40
 _MORE_PREDICTIONS = 1.5  # growth of the number of predictions after which a calibration is written again
 
 
-Published = tuple[Ints, Intervals, list[Packet]]
-"""Keys (K,) of the given components; keys of all new records; datagrams of the components."""
+Published = tuple[Ints, Intervals]
+"""Keys (K,) of the given components; keys of all new records."""
 
 
 class Author:
@@ -118,7 +117,7 @@ class Author:
 
     # -- components -------------------------------------------------------------------------------
 
-    def publish(self, components: Components, old: Intervals, max_bytes: int) -> Published:
+    def publish(self, components: Components, old: Intervals) -> Published:
         """Write new components, which supersede the records `old` of this robot."""
         if most_viewpoints(components) > MOST_VIEWPOINTS:
             raise InvalidArgumentError(
@@ -128,27 +127,21 @@ class Author:
         if not self._keys_of_robot.covers(old):
             raise InvalidArgumentError(f"A robot supersedes its own records only; robot={self._robot}.")
         if not len(components) and not old:
-            return np.zeros(0, np.int64), Intervals.empty(), []
+            return np.zeros(0, np.int64), Intervals.empty()
         values = quantize(self._records.fitting(components))
-        channels = bool(values.attributes)
         order = order_of(values.places)
-        first = self._numbers(len(order))
-        numbered = np.arange(first, first + len(order))
+        numbered = self._first + self._n + np.arange(len(order))
         values = replace(values.arranged(torch.from_numpy(order)), ids=ids_of(numbered))
-        # Components are added by datagrams here, too, so that all robots of a team have the same batches.
-        packets: list[Packet] = []
-        for datagram, part in fitted(values, max_bytes, channels):
-            added = self._records.add_components(part.restored(), bounded=False, complete=channels)
-            packets.append((datagram, added))
+        check_quantized(values)
+        self._numbers(len(order))
+        added = self._records.add_pieces(values.restored(), bounded=False, complete=bool(values.attributes))
         keys = np.empty_like(numbered)
         keys[order] = numbered
         successors = Intervals.of(numbered)
         superseded = self._supersede((old & self._records.held) - self._records.dead, successors)
-        return keys, Intervals.union([superseded, *(keys for _, keys in packets)]), packets
+        return keys, superseded | added
 
-    def publish_map(
-        self, components: Components, whole: bool, max_bytes: int, moved: MovedMap | None = None
-    ) -> Published:
+    def publish_map(self, components: Components, whole: bool, moved: MovedMap | None = None) -> Published:
         """Write what is new in a map, by content, and supersede what it no longer has. Keys are rising.
 
         whole: whether the map continues those of earlier incarnations, whose records are superseded, too, if
@@ -170,10 +163,10 @@ class Author:
         gone = set(candidates if whole else published) - set(keys.tolist())
         rows = np.flatnonzero(keys < 0)
         new = components.selected(torch.from_numpy(rows))
-        made, written, packets = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)), max_bytes)
+        made, written = self.publish(new, Intervals.of(np.array(sorted(gone), np.int64)))
         self._published = {*keys[keys >= 0].tolist(), *made.tolist()}
         corrected = [] if moved is None else self._correct_map(runs, moved.motions)
-        return np.sort(made), Intervals.union([written, *corrected]), packets
+        return np.sort(made), Intervals.union([written, *corrected])
 
     def _correct_map(self, runs: Mapping[int, Intervals], motions: Sequence[Tensor]) -> list[Intervals]:
         """Write the corrections of scans that have changed; returns the new records."""

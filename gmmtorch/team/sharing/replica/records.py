@@ -60,7 +60,8 @@ MOST_LABELS = 256
 """Of a channel of classes, as a view of the map has a column for each: 2 kB for each component."""
 _BATCH = 2048  # components of a stored batch
 _PIECE = 128
-"""Components of a batch in the table after loading: to drop one takes time in proportion to its batch."""
+"""Components of a batch in the table, unless a datagram brought it: to drop one takes time in proportion to
+its batch."""
 
 _log = logging.getLogger(__name__)
 _Record = TypeVar("_Record", bound=RecordMessage)
@@ -197,6 +198,13 @@ class Records:
         self._hold(held)
         self.dim = components.dim
         return added | added.shifted(CHANNELS) if complete else added
+
+    def add_pieces(self, components: Components, bounded: bool, complete: bool) -> Intervals:
+        """`add_components` in pieces of the table."""
+        pieces = torch.arange(len(components)).split(_PIECE)
+        return Intervals.union(
+            [self.add_components(components.selected(rows), bounded, complete) for rows in pieces]
+        )
 
     def _complete(self, keys: Ints, components: Components) -> None:
         """Give held components (K,) the channels that they lack."""
@@ -384,11 +392,9 @@ class Records:
         `own`. Raises as `add_components` does, and `DataError` for a damaged batch."""
         components = read_batch(data)
         is_own = components.ids[:, 0] == own
-        for rows in (is_own.nonzero().squeeze(1), (~is_own).nonzero().squeeze(1)):
-            for piece in rows.split(_PIECE):
-                part = components.selected(piece)
-                bounded = bool((part.ids[:, 0] != own).any())
-                self.add_components(part, bounded=bounded, complete=has_channels(data))
+        for rows, bounded in ((is_own, False), (~is_own, True)):
+            part = components.selected(rows.nonzero().squeeze(1))
+            self.add_pieces(part, bounded=bounded, complete=has_channels(data))
 
 
 def _n_entries(record: RecordMessage) -> int:

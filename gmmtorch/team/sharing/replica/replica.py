@@ -30,7 +30,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
     check_size,
     encode_announcements,
 )
-from gmmtorch.team.sharing.replica.anti_entropy import Backlog, packets
+from gmmtorch.team.sharing.replica.anti_entropy import ABOUT_A_DATAGRAM, Backlog, packets
 from gmmtorch.team.sharing.replica.authorship import Author, MovedMap, Published
 from gmmtorch.team.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
 from gmmtorch.team.sharing.replica.record_keys import (
@@ -101,7 +101,6 @@ class Replica:
         self._author = Author(self._records, self.robot, self.incarnation)
         self._backlog = Backlog(self.robot)
         self._channels = channels
-        self._max_bytes = MAX_BYTES  # of the last call of `datagrams`
         self.refused: Counter[str] = Counter()
         self.duplicates: Counter[int] = Counter()
         if own_frame:
@@ -131,7 +130,7 @@ class Replica:
                 self.calibrate(new.query_options.calibration)
             return self.publish(components, whole=False)
         old = Intervals.empty() if supersedes is None else Intervals.of(_keys("supersedes", supersedes))
-        return self._due(self._author.publish(self._checked(new), old, self._max_bytes))
+        return self._due(self._author.publish(self._checked(new), old))
 
     def publish(self, components: Components, *, whole: bool, moved: MovedMap | None = None) -> Tensor:
         """Make this robot's records those of its own map; returns the ids (K, 2) of new ones.
@@ -147,7 +146,7 @@ class Replica:
             return ids_of(np.zeros(0, np.int64))
         if moved is not None:
             moved = moved._replace(before=self._checked(moved.before))
-        return self._due(self._author.publish_map(self._checked(components), whole, self._max_bytes, moved))
+        return self._due(self._author.publish_map(self._checked(components), whole, moved))
 
     def count(self, gains: Mapping[tuple[int, int], float]) -> None:
         """Add points that components (robot, sequence), of any robot, have gained since the last call."""
@@ -201,8 +200,8 @@ class Replica:
         return whole if rest is None else Pose.from_matrix(rest).inverse().matrix @ whole
 
     def _due(self, made: Published) -> Tensor:
-        keys, written, packets = made
-        self._backlog.add(written, packets)
+        keys, written = made
+        self._backlog.add(written)
         return ids_of(keys)
 
     # -- sending and receiving --------------------------------------------------------------------
@@ -215,13 +214,11 @@ class Replica:
         their information, then counters.
         """
         check_size(max_bytes)
-        self._max_bytes = max_bytes
         left = np.inf if budget is None else check_whole("budget", budget, 0)
         sent: list[bytes] = []
         sent_keys = Intervals.empty()
         self._backlog.due -= self._records.known_dead
-        due, ready = self._backlog.due, self._backlog.ready
-        for datagram, keys in packets(self._records, due, ready, max_bytes, budget is not None):
+        for datagram, keys in packets(self._records, self._backlog.due, max_bytes, budget is not None):
             left -= len(datagram)
             if left < 0:
                 break
@@ -376,6 +373,17 @@ class Replica:
         """Keys of records that other robots have announced and that this robot lacks. Robots without a recent
         announcement are left out: see `anti_entropy.PATIENCE`. Keys of channels are below zero."""
         return self._backlog.missing(self._records.known)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether this robot holds all records that their authors gave before others that it holds."""
+        begins = self.held.edges[::2]
+        return bool((begins == authors(begins) << NUMBER_BITS).all())
+
+    @property
+    def waits(self) -> bool:
+        """Whether what is due fills less than a datagram, so that it takes fewer bytes together with more."""
+        return self._backlog.due.size < ABOUT_A_DATAGRAM
 
     @property
     def version(self) -> int:
