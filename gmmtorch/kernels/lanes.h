@@ -52,10 +52,11 @@ constexpr int LANES = Lanes::LANES;
 
 // Takes the lowest of some bits, and returns its number.
 GMM_INLINE int take_lowest(unsigned& left) {
-#if defined(__CUDA_ARCH__)
-    const int found = __ffs(left) - 1;
-#else
+#if defined(GMM_VECTORS)
     const int found = __builtin_ctz(left);
+#else
+    int found = 0;
+    while (!(left >> found & 1)) ++found;
 #endif
     left &= left - 1;
     return found;

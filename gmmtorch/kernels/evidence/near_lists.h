@@ -13,14 +13,14 @@ struct Sight {
 
 // Whether the ray beyond x passes the mean, or ends before it, within the longest half axis of the
 // ellipsoid: a quick test, conservative except near the sensor origin. All of the ellipsoid lies within that
-// distance of the mean. squares: of the half axes, ascending.
+// distance of the mean.
 template <int DIM>
-GMM_INLINE mask sees(const double* row, const vec* x, vec reach, double spread, const double* squares,
+GMM_INLINE mask sees(const double* row, const vec* x, vec reach, double spread, double cutoff,
                      Sight<DIM>& sight) {
-    const double *mean = row + DIM * DIM, *origin = mean + DIM;
+    const double *mean = row + DIM * DIM, *origin = mean + DIM, *variance = mean + 3 * DIM;
     double mm = 0.0;
     for (int j = 0; j < DIM; ++j) mm += (mean[j] - origin[j]) * (mean[j] - origin[j]);
-    const double whole = root(mm), longest = root(squares[DIM - 1]);
+    const double whole = root(mm), longest = cutoff * root(maximum(variance[DIM - 1], 0.0));
     vec along = (vec)(0.0), square = (vec)(0.0);
     for (int j = 0; j < DIM; ++j) {
         sight.ray[j] = x[j] - origin[j];
@@ -73,7 +73,7 @@ GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, c
             double squares[DIM];
             for (int j = 0; j < DIM; ++j) squares[j] = cutoff * cutoff * maximum(variance[j], 0.0);
             Sight<DIM> sight;
-            mask close = sees<DIM>(row, x, reach, spread, squares, sight);
+            mask close = sees<DIM>(row, x, reach, spread, cutoff, sight);
             const vec widened = sight.widened * sight.widened, beta = sight.beta;
             vec y[DIM], z[DIM];
             if (any(active & close)) {

@@ -216,10 +216,8 @@ GMM_KERNEL grouped_evidence(int64_t item, const double* points, const int64_t* o
     GMM_SHARED unsigned near[THREADS];
     for (int64_t first = 0; first < n_cones; first += THREADS) {
         const double* row = table + minimum(first + squad.lane, n_cones - 1) * WIDTH;
-        double squares[DIM];
-        for (int j = 0; j < DIM; ++j) squares[j] = limit * maximum(row[DIM * DIM + 3 * DIM + j], 0.0);
         Sight<DIM> sight;
-        mask close = sees<DIM>(row, center, reach, spread, squares, sight);
+        mask close = sees<DIM>(row, center, reach, spread, cutoff, sight);
         close |= sight.distance <= (reach + cube_reach) * (1.0 + 1e-9);
         meet(squad);
         near[squad.lane] = bits(close) & used;
