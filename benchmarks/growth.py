@@ -116,7 +116,7 @@ def draw(rows: list[list[Any]], path: Path) -> None:
     for line, one in zip(panels, recorded, strict=True):
         for column, (axes, title) in enumerate(zip(line, titles, strict=True), 3):
             for index, name in enumerate(MAPS):
-                found = [(row[2], max(row[column], 0.01)) for row in rows if row[:2] == [one, name]]
+                found = sorted((row[2], max(row[column], 0.01)) for row in rows if row[:2] == [one, name])
                 if found:
                     axes.plot(*zip(*found, strict=True), label=name, **line_look(index))
             log_axis(axes, "y", [max(row[column], 0.01) for row in rows if row[0] == one])

@@ -62,7 +62,7 @@ SHOWN: dict[str, dict[str, tuple[str, ...]]] = {
             "on the wire, with headers (kB)",
         )
     },
-    "growth": {"scans": ("228",)},
+    "growth": {"scans": ("228", "168", "2008")},
     "kernels": {
         "work": (
             "rays through 0.2 m, counted, dense",

@@ -14,11 +14,12 @@ from .evidence.beam_passes import beam_passes as beam_passes
 from .evidence.grid_flux import add_cell_mass as add_cell_mass
 from .evidence.grid_flux import add_row_flux as add_row_flux
 from .evidence.grid_flux import whitened_rows as whitened_rows
+from .evidence.point_evidence import GROUP as GROUP
 from .evidence.point_evidence import Lists as Lists
 from .evidence.point_evidence import PointTable as PointTable
 from .evidence.point_evidence import few_points_evidence as few_points_evidence
+from .evidence.point_evidence import grouped_evidence as grouped_evidence
 from .evidence.point_evidence import listed_evidence as listed_evidence
-from .evidence.point_evidence import near_cones as near_cones
 from .evidence.point_evidence import near_lists as near_lists
 from .evidence.point_evidence import pair_evidence as pair_evidence
 from .mixtures.cell_sums import KEY_BITS as KEY_BITS

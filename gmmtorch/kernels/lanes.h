@@ -20,6 +20,7 @@ struct OneLane {
 };
 
 GMM_INLINE bool any(bool m) { return m; }
+GMM_INLINE unsigned bits(bool m) { return m; }
 GMM_INLINE double root(double x) { return sqrt(x); }
 GMM_INLINE double down(double x) { return floor(x); }
 GMM_INLINE double nearby(double x) { return rint(x); }
@@ -49,8 +50,24 @@ typedef Lanes::vec vec;
 typedef Lanes::mask mask;
 constexpr int LANES = Lanes::LANES;
 
+// Takes the lowest of some bits, and returns its number.
+GMM_INLINE int take_lowest(unsigned& left) {
+#if defined(GMM_VECTORS)
+    const int found = __builtin_ctz(left);
+#else
+    int found = 0;
+    while (!(left >> found & 1)) ++found;
+#endif
+    left &= left - 1;
+    return found;
+}
+
 #if defined(GMM_VECTORS)
 GMM_INLINE bool any(mask m) { return __builtin_reduce_or(m) != 0; }
+GMM_INLINE unsigned bits(mask m) {
+    typedef bool flags __attribute__((ext_vector_type(8)));
+    return __builtin_bit_cast(unsigned char, __builtin_convertvector(m, flags));
+}
 GMM_INLINE vec root(vec x) { return __builtin_elementwise_sqrt(x); }
 GMM_INLINE vec down(vec x) { return __builtin_elementwise_floor(x); }
 GMM_INLINE vec nearby(vec x) { return __builtin_elementwise_roundeven(x); }

@@ -18,6 +18,7 @@ import gmmtorch.kernels
 from gmmtorch.errors import GmmTorchError
 from gmmtorch.kernels import compiler
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
+from gmmtorch.kernels.evidence import point_evidence
 from gmmtorch.kernels.mixtures import cell_sums, em_loops, pair_merges
 from gmmtorch.kernels.rays import beam_information
 
@@ -83,13 +84,14 @@ def test_every_kernel_of_a_source_is_launched_under_a_name_of_its_own():
 
 def test_constants_of_the_sources_are_those_of_the_modules(tmp_path):
     names = ["LANES", "BLOCK", "KEY_BITS", "REACH", "PATCH", "REACHED", "WORTHLESS", "IMAGE_ODDS"]
-    names += ["MERGED", "SELECTION_COUNTS"]
+    names += ["MERGED", "SELECTION_COUNTS", "GROUP"]
     body = " ".join(f"x[{place}] = {name};" for place, name in enumerate(names))
     found = torch.zeros(len(names)).double()
     sources = FOLDER / "mixtures/depth_cells.h", FOLDER / "rays/beam_information.h"
-    sources += FOLDER / "mixtures/em_loops.h", FOLDER / "selection.h"
+    sources += FOLDER / "mixtures/em_loops.h", FOLDER / "selection.h", FOLDER / "evidence/point_evidence.h"
     kernel_of(tmp_path, body, *sources)(1, found)
     modules = [compiler, compiler, *[cell_sums] * 3, *[beam_information] * 3, em_loops, pair_merges]
+    modules.append(point_evidence)
     values = [
         getattr(module, {"LANES": "CPU_LANES", "BLOCK": "_BLOCK"}.get(name, name))
         for module, name in zip(modules, names, strict=True)

@@ -87,7 +87,13 @@ GMM_KERNEL few_points_evidence(int64_t item, const int64_t* chosen, const double
             for (int l = 0; l < LANES; ++l)
                 for (int a = 0; a < DIM; ++a)
                     set(x[a], l, points[minimum(begin + l, n_points - 1) * DIM + a]);
-            add_evidence<DIM>(cone, x, h, cutoff * cutoff, (vec)(1.0) > 0.0, hits, misses);
+            const double limit = cutoff * cutoff;
+            if (any(Quick<DIM>(cone, h, limit).passes(x))) {
+                Pairs<DIM> pairs;
+                const mask found = meeting<DIM>(cone, x, h, limit, pairs);
+                evaluate<DIM>(pairs, h, limit, hits, misses);
+                hits = found ? hits : (vec)(0.0), misses = found ? misses : (vec)(0.0);
+            }
             for (int l = 0; l < LANES && begin + l < n_points; ++l) {
                 values[begin + l] = get(hits, l);
                 values[n_points + begin + l] = get(misses, l);

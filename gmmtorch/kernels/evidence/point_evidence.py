@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.kernels.choice import is_fused
-from gmmtorch.kernels.compiler import CPU_LANES, templated
+from gmmtorch.kernels.compiler import CPU_LANES, squad_size, templated
 from gmmtorch.linalg import ragged_index
 
 _SQRT_HALF_PI = math.sqrt(math.pi / 2)
@@ -46,9 +46,9 @@ def listed_evidence(
     rows: Tensor,
     resolution: float,
     cutoff: float,
-    found: Tensor,
+    found: tuple[Tensor, Tensor],
 ) -> None:
-    """Adds hits and misses of the points in `order` to `found` (2, M), float64, by the fused kernel.
+    """Adds hits and misses of the points in `order` to `found`, (M,) float64 each, by the fused kernel.
 
     Cones are added one after the other, so that two calls with parts of the lists equal one with both.
 
@@ -62,6 +62,28 @@ def listed_evidence(
     lanes = CPU_LANES if points.device.type == "cpu" else 1
     given = points, order, bucket, len(order), *lists, rows
     _EVIDENCE[points.shape[1]](-(-len(order) // lanes), *given, resolution, cutoff, *found)
+
+
+_GROUPED = templated("evidence/point_evidence.h", "grouped_evidence", (2, 3))
+GROUP = 64
+"""Neighbouring points whose cones are found together, as in `point_evidence.h`."""
+
+
+def grouped_evidence(
+    points: Tensor,
+    order: Tensor,
+    boxes: tuple[Tensor, Tensor],
+    rows: Tensor,
+    resolution: float,
+    cutoff: float,
+    found: tuple[Tensor, Tensor],
+) -> None:
+    """`listed_evidence` of all cones: points are compared with each. boxes: low, high (G, D) of each `GROUP`
+    of points."""
+    device, n_groups = points.device, len(boxes[0])
+    n_items = -(-n_groups // CPU_LANES) if device.type == "cpu" else n_groups * squad_size(device)
+    given = points, order, len(order), *boxes, rows, len(rows), resolution, cutoff
+    _GROUPED[points.shape[1]](n_items, *given, *found)
 
 
 def pair_evidence(
@@ -221,34 +243,18 @@ def near_lists(
     if is_fused(table, given.entries, lists, centers):
         ends = lengths.cumsum(0)
         firsts, n_entries = ends - lengths, int(ends[-1]) if len(ends) else 0
-        balls = lists, firsts, centers, radii
-        near, counts = _near_flags(table, given, balls, n_entries, cube_reach, spread, cutoff)
+        near = torch.empty(n_entries, dtype=torch.bool, device=table.device)
+        counts, n = torch.zeros_like(radii), len(lists)
+        lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
+        balls = lists, firsts, centers, radii, n, cube_reach, spread
+        rest = table.shape[1], cutoff, parts, near, counts
+        _NEAR[centers.shape[1]](-(-n // lanes) * parts, table, *given, *balls, *rest)
+        counts = counts.long()
         shift = torch.repeat_interleave(given.starts[lists] - firsts, counts)
         return Lists.of(counts, given.entries[near.nonzero().squeeze(1) + shift])
     ball, cone = given.taken(lists)
     near = _near_cone(table.T, cone, centers[ball], radii[ball], cube_reach, spread, cutoff)
     return Lists.of(torch.bincount(ball[near], minlength=len(lists)), cone[near].int())
-
-
-def near_cones(table: Tensor, centers: Tensor, radii: Tensor, *sizes: float) -> Lists:
-    """`near_lists` of all cones, at least one, by the fused kernel; takes fewer operations."""
-    n, n_balls, device = len(table), len(centers), table.device
-    every, firsts = (torch.arange(0, n * m, step, device=device) for m, step in ((1, 1), (n_balls, n)))
-    given, balls = Lists(torch.arange(0, n + 1, n, device=device), every.int()), (firsts, centers, radii)
-    near, counts = _near_flags(table, given, (torch.zeros_like(firsts), *balls), n * n_balls, *sizes)
-    return Lists.of(counts, near.view(n_balls, n).nonzero()[:, 1].int())
-
-
-def _near_flags(
-    table: Tensor, given: Lists, balls: tuple[Tensor, ...], n_entries: int, *sizes: float
-) -> tuple[Tensor, Tensor]:
-    """Which entries are near, for balls: their list, first entry, centre, radius; how many each ball has."""
-    near = torch.empty(n_entries, dtype=torch.bool, device=table.device)
-    counts, n, (reach, spread, cutoff) = torch.zeros_like(balls[3]), len(balls[0]), sizes
-    lanes, parts = (CPU_LANES, 1) if table.device.type == "cpu" else (1, _PARTS_OF_LISTS)
-    rest = n, reach, spread, table.shape[1], cutoff, parts, near, counts
-    _NEAR[balls[2].shape[1]](-(-n // lanes) * parts, table, *given, *balls, *rest)
-    return near, counts.long()
 
 
 def _near_cone(

@@ -17,9 +17,17 @@ from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
 from gmmtorch.errors import InvalidArgumentError, MemoryLimitError
-from gmmtorch.kernels import PointTable, chunked, is_fused, listed_evidence, near_cones, pair_evidence
+from gmmtorch.kernels import (
+    GROUP,
+    PointTable,
+    chunked,
+    grouped_evidence,
+    is_fused,
+    listed_evidence,
+    pair_evidence,
+)
 from gmmtorch.linalg import order_along_curve, safe_cholesky
-from gmmtorch.occupancy.cone_index import ConeIndex, Hulls, chunks_of, replaced_rows, spectrum_of
+from gmmtorch.occupancy.cone_index import ConeIndex, chunks_of, replaced_rows, spectrum_of
 from gmmtorch.occupancy.cones import CUTOFF, Cones, former_rows
 from gmmtorch.occupancy.evidence import occupancy_probability
 from gmmtorch.occupancy.grid import MEMORY_LIMIT, VoxelGrid, check_resolution
@@ -66,16 +74,14 @@ CHUNK_PAIRS = 1 << 16
 
 _CHUNK_POINTS = 1 << 20  # points sorted in one pass
 _FARTHEST = 1e15  # metres: products of larger positions are infinite
-_GROUP = 64  # points whose cones are found together
 _FEW_POINTS = 1 << 11
 _FEW_PAIRS = 1 << 23  # of a point and a cone: for at most so many an index does not pay
 
 
 class PointGroups:
-    """Points (M, D), float64. Few need no index: cones are found for groups of `_GROUP` neighbours.
+    """Points (M, D), float64. Few need no index: cones are found for groups of `GROUP` neighbours.
 
-    order (R,): the points that are not too far away, group by group. bucket (M,): the group of each point.
-    box: low, high (G, D) of each group. ball: centers (G, D) and radii (G,), around the points of each group.
+    order (R,): the points that are not too far away, group by group. box: low, high (G, D) of each group.
     """
 
     def __init__(self, points: Tensor) -> None:
@@ -87,25 +93,11 @@ class PointGroups:
         return order[order_along_curve(self.points[order])] if len(order) else order
 
     @functools.cached_property
-    def bucket(self) -> Tensor:
-        group = torch.arange(len(self.order), device=self.order.device) // _GROUP
-        return torch.zeros_like(self.points[:, 0], dtype=torch.int64).index_copy_(0, self.order, group)
-
-    @functools.cached_property
-    def _grouped(self) -> Tensor:
-        """(G, `_GROUP`, D), the last group with repetitions."""
-        missing = -len(self.order) % _GROUP
-        order = torch.cat([self.order, self.order[-1:].expand(missing)]) if missing else self.order
-        return self.points.detach()[order].view(-1, _GROUP, self.points.shape[1])
-
-    @functools.cached_property
     def box(self) -> tuple[Tensor, Tensor]:
-        return self._grouped.amin(1), self._grouped.amax(1)
-
-    @functools.cached_property
-    def ball(self) -> tuple[Tensor, Tensor]:
-        centers = 0.5 * (self.box[0] + self.box[1])
-        return centers, (self._grouped - centers[:, None]).norm(dim=2).amax(1)
+        missing = -len(self.order) % GROUP
+        order = torch.cat([self.order, self.order[-1:].expand(missing)]) if missing else self.order
+        grouped = self.points.detach()[order].view(-1, GROUP, self.points.shape[1])
+        return grouped.amin(1), grouped.amax(1)
 
 
 class PointEvidence(NamedTuple):
@@ -229,7 +221,7 @@ class PointForm:
 
     def __call__(self, points: ArrayLike | PointGroups, before: PointEvidence | None = None) -> PointEvidence:
         """Hits and misses at points (M, D), world metres; zero at infinite points. `before`: of other cones,
-        to which these are added.
+        to which these are added, in its memory if possible.
 
         Raises `InvalidArgumentError` for another shape, or NaN.
         """
@@ -237,7 +229,7 @@ class PointForm:
         query = given.points
         before = before or PointEvidence(*torch.zeros(2, len(query), dtype=query.dtype, device=query.device))
         if given.are_few and is_fused(query, self.rows):
-            return PointEvidence(*self._added(given, torch.stack([*before])))
+            return self._added(given, before)
 
         def evaluated(part: slice) -> PointEvidence:
             return self._evaluate(query[part], before.hits[part], before.misses[part])
@@ -248,7 +240,7 @@ class PointForm:
 
     def _evaluate(self, points: Tensor, hits: Tensor, misses: Tensor) -> PointEvidence:
         if is_fused(points, self.rows):
-            return PointEvidence(*self._added(PointGroups(points), torch.stack([hits, misses])))
+            return self._added(PointGroups(points), PointEvidence(hits, misses))
         for rows, number in self.index.parts(points):
             if not len(rows):
                 continue
@@ -259,17 +251,15 @@ class PointForm:
             hits, misses = hits.index_add(0, rows, hit), misses.index_add(0, rows, miss)
         return PointEvidence(hits, misses)
 
-    def _added(self, points: PointGroups, found: Tensor) -> Tensor:
-        """`found` (2, M), to which hits and misses at M points are added by the fused kernel."""
+    def _added(self, points: PointGroups, found: PointEvidence) -> PointEvidence:
+        """`found`, to which hits and misses at M points are added by the fused kernel."""
         every = points.points
         settings = self.rows, self.resolution, self.cutoff, found
         if len(every) * len(self.rows) > _FEW_PAIRS:
             for rows, number in self.index.parts(every):
                 listed_evidence(every, rows, number, self.index.lists, *settings)
         elif len(self.rows) and len(points.order):
-            hulls = Hulls(self.rows, self.resolution, self.cutoff, smoothed=True)
-            lists = near_cones(self.rows, *points.ball, hulls.reach, hulls.spread, hulls.cutoff)
-            listed_evidence(every, points.order, points.bucket, lists, *settings)
+            grouped_evidence(every, points.order, points.box, *settings)
         return found
 
     def _near_cones(self, blocks: PointBlocks, part: slice) -> tuple[Tensor, Tensor]:
