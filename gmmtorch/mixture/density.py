@@ -95,7 +95,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     def predict(self, X: Array) -> Array:
         """Index (N,) of the most likely component of each point."""
         points = self._as_points(X)
-        labels = torch.cat([part.argmax(0) for part in self._joint(points)])
+        labels = torch.cat([part.max(0).indices for part in self._joint(points)])
         return labels if isinstance(X, Tensor) else labels.cpu().numpy()
 
     def _joint(self, points: Tensor) -> Iterator[Tensor]:
