@@ -143,19 +143,22 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
                 f"Invalid value for 'n_samples': {n_samples!r}. Give a whole number of at least 1."
             )
         generator = as_generator(self.random_state if random_state is None else random_state)
-        weights = self.weights.cpu()
-        labels = torch.multinomial(weights, n_samples, True, generator=generator).sort().values
-        normals = torch.randn(n_samples, means.shape[1], dtype=torch.float64, generator=generator)
-        labels, normals = labels.to(means.device), normals.to(means.device)
+        # NumPy's normal numbers take half the time of torch's.
+        numbers = np.random.default_rng(int(torch.randint(2**63 - 1, (), generator=generator)))
+        share = self.weights.detach().cpu().numpy()
+        sizes = torch.from_numpy(numbers.multinomial(n_samples, share / share.sum())).to(means.device)
+        labels = torch.repeat_interleave(sizes, output_size=n_samples)
+        points = torch.from_numpy(numbers.standard_normal((n_samples, means.shape[1]))).to(means.device)
         spread = self._typed_covariances()
         if self._fitted_type in ("full", "tied"):
             factors = safe_cholesky(spread.view(-1, *spread.shape[-2:])).expand(len(means), -1, -1)
-            sizes = labels.bincount(minlength=len(means)).tolist()
-            parts = zip(normals.split(sizes), factors, strict=True)
-            points = torch.cat([part @ factor.T for part, factor in parts])
+            parts = zip(means, points.split(sizes.tolist()), factors, strict=True)
+            points = torch.cat([torch.addmm(mean, part, factor.mT) for mean, part, factor in parts])
         else:
-            points = normals.mul_(spread.sqrt().view(len(means), -1)[labels])
-        points.add_(means[labels])
+            scale, rows = spread.sqrt().view(len(means), -1), by_type.chunk_rows(points)
+            for i in range(0, n_samples, rows):
+                own = labels[i : i + rows]
+                points[i : i + rows].mul_(scale[own]).add_(means[own])
         return (points, labels) if self._tensors else (points.cpu().numpy(), labels.cpu().numpy())
 
     @property
