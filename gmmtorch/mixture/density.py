@@ -16,7 +16,7 @@ from sklearn.utils._param_validation import InvalidParameterError as ScikitLearn
 from sklearn.utils.validation import validate_data
 from torch import Tensor, nn
 
-from gmmtorch.arrays import DeviceModule, check_unmasked
+from gmmtorch.arrays import DeviceModule, check_dense
 from gmmtorch.errors import GmmTorchError, InvalidArgumentError
 from gmmtorch.linalg import inverse_factor, safe_cholesky
 from gmmtorch.mixture.em import by_type
@@ -223,7 +223,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         if (plain := self._shared(X, reset)) is not None:
             points = plain if reset else plain.to(self.means.device)
         elif not isinstance(X, Tensor):
-            check_unmasked(X, "X")
+            check_dense(X, "X")
             checked = validate_data(
                 self, X, reset=reset, dtype=[np.float64, np.float32], ensure_min_samples=1
             )
