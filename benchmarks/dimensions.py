@@ -258,8 +258,8 @@ CASE = Case(
     measure,
     "Three iterations from the same start; the last rows are whole fits, each from its own start from "
     "k-means, with the nats of both (means over ten seeds of digits and iris, three of images). A cell: our "
-    "CPU seconds / those of scikit-learn, how many times faster fit, repeated score and predict, and sample (at most "
-    "50,000 points) are, our share of its peak memory where either is above 10 MB.",
+    "CPU seconds / those of scikit-learn, how many times faster are fit, repeated score and predict, and "
+    "sample (at most 50,000 points), our share of its peak memory where either is above 10 MB.",
     {"K": ".0f"},
     key=3,
     needs_data=False,
