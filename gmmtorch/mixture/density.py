@@ -249,7 +249,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
         """The memory of a table that needs no `validate_data`, which takes longer than a small fit."""
         if type(X) is not np.ndarray or X.dtype != np.float64 or not X.dtype.isnative or X.ndim != 2:
             return None
-        if X.size == 0 or not (X.flags.c_contiguous and X.flags.writeable):
+        if X.size == 0 or not X.flags.writeable or any(step < 0 or step % 8 for step in X.strides):
             return None
         if not reset and ("feature_names_in_" in vars(self) or X.shape[1] != self.n_features_in_):
             return None

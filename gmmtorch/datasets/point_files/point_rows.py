@@ -142,7 +142,7 @@ def _table_shape(array: np.ndarray, name: str) -> tuple[int, int]:
     if array.ndim != 2 or array.shape[1] == 0 or array.dtype.kind not in "bfiu":
         raise DataError(
             f"{name} holds {array.dtype} {array.shape}; expected real numbers of shape (N, D), one point "
-            "per row."
+            "per row. Convert objects first: np.asarray(points, dtype=float)."
         )
     return array.shape[0], array.shape[1]
 
