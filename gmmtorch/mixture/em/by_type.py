@@ -166,7 +166,7 @@ class Factors:
             points = points @ self.whiten.mT if self.kind == "tied" else points
             # Large products of full covariances gain more from their size than they lose in the cache.
             on_cpu, most = points.device.type == "cpu", chunk_elements(points.device)
-            most *= 3 if on_cpu and self.kind == "full" else 1
+            most *= 2 if on_cpu and self.kind == "full" and dim > 100 else 1
             rows = max(64, min(_ROWS if on_cpu else 1 << 16, most // dim))
             found = []
             for some in points.split(rows):
