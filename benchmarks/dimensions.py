@@ -30,6 +30,7 @@ from gmmtorch.experiments.harness import Case, Row, alone, clock, run
 from gmmtorch.mixture.em.exact import COVARIANCE_TYPES, type_shape
 
 N_ITER = 3
+MOST_SAMPLED = 50_000
 SEED = 5
 SEEDS = {"digits": 10, "iris": 10, "images": 3}
 """Starts whose nats are averaged: the nats of one differ more than those of two packages."""
@@ -153,8 +154,25 @@ def fitted(package: str, points: np.ndarray, cell: Cell, seed: int) -> Any:
     return import_module("tgmm").GaussianMixture(cell.k, cell.dim, **settings, **first).fit(table)
 
 
+ANSWERS: dict[str, Callable[[Any, Any], object]] = {
+    "score": lambda mixture, points: mixture.score_samples(points),
+    "predict": lambda mixture, points: mixture.predict(points),
+    "sample": lambda mixture, points: mixture.sample(min(len(points), MOST_SAMPLED)),
+}
+
+
+def least(answer: Callable[[], object]) -> float:
+    """The least seconds of three calls; of fewer, if they take long."""
+    seconds: list[float] = []
+    while len(seconds) < 3 and sum(seconds) < 5:
+        begin = clock()
+        answer()
+        seconds.append(clock() - begin)
+    return min(seconds)
+
+
 def measured(cell: Cell, packages: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Seconds of the processor of a fit and of its score, the memory of the fit, and what it found.
+    """Seconds of the processor of a fit and of what it answers, the memory of the fit, and what it found.
 
     The packages take turns, because other programs load the machine.
     """
@@ -165,7 +183,7 @@ def measured(cell: Cell, packages: tuple[str, ...]) -> dict[str, dict[str, float
     }
     table["torchgmm"] = torch.from_numpy(points).float()
     found: dict[str, list[tuple[float, ...]]] = {name: [] for name in packages}
-    least, total = SEEDS.get(cell.table, 1), 0.0
+    n_seeds, total = SEEDS.get(cell.table, 1), 0.0
     for seed in range(20):
         for name in packages if seed % 2 else packages[::-1]:
             ctypes.CDLL(None).malloc_trim(0)
@@ -173,21 +191,19 @@ def measured(cell: Cell, packages: tuple[str, ...]) -> dict[str, dict[str, float
             before = status("VmRSS")
             begin = clock()
             mixture = fitted(name, points, cell, seed)
-            seconds, megabytes, scores = clock() - begin, status("VmHWM") - before, []
-            for _ in range(3):  # the first makes what the next ones find
-                begin = clock()
-                value = float(mixture.score(table[name]))
-                scores.append(clock() - begin)
+            seconds, megabytes = clock() - begin, status("VmHWM") - before
+            value = float(mixture.score(table[name]))  # makes what the next ones find
             value = -value if name == "torchgmm" else value  # the negative log-likelihood
-            found[name].append((seconds, min(scores), megabytes, value))
-            total += seconds + sum(scores)
-        if seed + 1 >= least and (total > 3 or (total > 1 and seed >= 4)):
+            answers = [least(lambda m=mixture, x=table[name], of=of: of(m, x)) for of in ANSWERS.values()]
+            found[name].append((seconds, *answers, megabytes, value))
+            total += seconds + sum(answers)
+        if seed + 1 >= n_seeds and (total > 3 or (total > 1 and seed >= 4)):
             break
     result = {}
     for name, runs in found.items():
         low = np.min(runs, 0)
-        nats = float(np.mean([run[3] for run in runs[:least]]))
-        result[name] = {"seconds": low[0], "score": low[1], "megabytes": low[2], "nats": nats}
+        nats = float(np.mean([run[-1] for run in runs[:n_seeds]]))
+        result[name] = dict(zip(("seconds", *ANSWERS, "megabytes"), low, strict=False)) | {"nats": nats}
     return result
 
 
@@ -216,11 +232,16 @@ def measure(options: Any) -> Iterator[Row]:
         yield row | {cell.kind: comparison(found[cell.kind], bool(cell.table)) for cell in some}
 
 
+def times(peer: dict[str, float], ours: dict[str, float], name: str) -> str:
+    """How many times faster ours is."""
+    return f"{peer[name] / ours[name]:.2g}×"
+
+
 def comparison(found: dict[str, dict[str, float]], own_start: bool) -> str:
-    """Seconds; how many times faster fit and score are; the share of memory, if it is measurable."""
+    """Seconds; how many times faster the fit and what it answers are; the share of memory, if measurable."""
     ours, peer, *others = found.values()
-    fit, score = (peer[name] / ours[name] for name in ("seconds", "score"))
-    text = f"{ours['seconds']:.2g} / {peer['seconds']:.2g} s: {fit:.1f}×, score {score:.1f}×"
+    text = f"{ours['seconds']:.2g} / {peer['seconds']:.2g} s: {times(peer, ours, 'seconds')}"
+    text += "".join(f", {name} {times(peer, ours, name)}" for name in ANSWERS)
     if peer["megabytes"] > 10 or ours["megabytes"] > 10:
         text += f", memory {ours['megabytes'] / max(peer['megabytes'], 1):.2f}"
     for name, other in zip(list(found)[2:], others, strict=True):
@@ -237,8 +258,8 @@ CASE = Case(
     measure,
     "Three iterations from the same start; the last rows are whole fits, each from its own start from "
     "k-means, with the nats of both (means over ten seeds of digits and iris, three of images). A cell: our "
-    "CPU seconds / those of scikit-learn, how many times faster fit and repeated score are, our share of its "
-    "peak memory where either is above 10 MB.",
+    "CPU seconds / those of scikit-learn, how many times faster are fit, repeated score and predict, and "
+    "sample (at most 50,000 points), our share of its peak memory where either is above 10 MB.",
     {"K": ".0f"},
     key=3,
     needs_data=False,

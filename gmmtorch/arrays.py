@@ -34,7 +34,7 @@ def as_tensor(
         device: device of the result. None: that of a tensor, otherwise the CPU.
 
     Raises `InvalidArgumentError` for masked arrays, whose mask would be lost, for complex numbers, objects,
-    strings, sparse tensors, and lists whose rows have different lengths.
+    strings, sparse arrays and tensors, and lists whose rows have different lengths.
     """
     if type(value) is Tensor and value.dtype is dtype and device is None and _is_plain(value):
         return value
@@ -113,7 +113,7 @@ def _tensor(value: Any, name: str) -> Tensor:
 
 def _array(value: Any, name: str) -> np.ndarray:
     """An array of real numbers that torch can share."""
-    check_unmasked(value, name)
+    check_dense(value, name)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -141,14 +141,16 @@ def is_floating(value: ArrayLike) -> bool:
     return value.is_floating_point() if isinstance(value, Tensor) else np.asarray(value).dtype.kind == "f"
 
 
-def check_unmasked(value: Any, name: str) -> None:
-    """Raise `InvalidArgumentError` for a masked array, whose mask would be lost."""
+def check_dense(value: Any, name: str) -> None:
+    """Raise `InvalidArgumentError` for a masked array, whose mask would be lost, and for a sparse one."""
     if isinstance(value, np.ma.MaskedArray):
         raise InvalidArgumentError(
             f"{name} is a masked array, and its mask would be lost; remove the masked rows first, "
             f"{name}.data[~np.ma.getmaskarray({name}).reshape(len({name}), -1).any(1)], or fill them with "
             f"{name}.filled(value)."
         )
+    if hasattr(value, "toarray"):
+        raise InvalidArgumentError(f"{name} is sparse, a {type(value).__name__}; give {name}.toarray().")
 
 
 def _complex(name: str, dtype: object) -> InvalidArgumentError:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 
 import gmmtorch as gt
@@ -325,6 +326,7 @@ def test_what_is_no_array_of_numbers_is_refused(case):
         ([torch.zeros(2), torch.zeros(3)], r"^x has parts of shapes \(2,\), \(3,\)"),
         (None, r"^x is a NoneType of dtype object"),
         (np.array(["2020-01-01"], dtype="datetime64[D]"), r"^x is a ndarray of dtype datetime64"),
+        (scipy.sparse.eye_array(2, format="csr"), r"^x is sparse, a csr_array; give x\.toarray"),
         (torch.eye(2).to_sparse(), r"^x is a torch.sparse_coo tensor; give x\.to_dense"),
     ],
 )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.sparse
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -221,9 +222,11 @@ def test_open_points_rejects_arrays_of_other_shapes_and_types(tmp_path, array):
         open_points(path)
 
 
-def test_the_mask_of_an_array_is_not_lost():
+def test_masked_and_sparse_arrays_are_errors_that_name_the_remedy():
     with pytest.raises(InvalidArgumentError, match=r"^points is a masked array"):
         in_memory(np.ma.masked_less(np.ones((3, 2)), 2.0))
+    with pytest.raises(InvalidArgumentError, match=r"^points is sparse, a csr_array; give points.toarray"):
+        in_memory(scipy.sparse.csr_array(np.ones((3, 2))))
 
 
 def test_open_points_rejects_missing_files_and_unknown_suffixes(tmp_path):

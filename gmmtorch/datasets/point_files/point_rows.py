@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 from torch import Tensor
 
-from gmmtorch.arrays import ArrayLike, as_tensor, check_unmasked
+from gmmtorch.arrays import ArrayLike, as_tensor, check_dense
 from gmmtorch.datasets.base import number_rows
 from gmmtorch.errors import DataError
 
@@ -38,7 +38,7 @@ class ArrayRows:
     """The rows of an array or tensor (N, D) in memory."""
 
     def __init__(self, points: ArrayLike, name: str = "points") -> None:
-        check_unmasked(points, name)
+        check_dense(points, name)
         # Arrays stay as they are: a block of them is converted at a time, and a memory map is not loaded.
         is_tensor = isinstance(points, Tensor)
         self._array = as_tensor(points, name).detach().cpu().numpy() if is_tensor else np.asarray(points)
@@ -139,10 +139,10 @@ class TextRows:
 
 
 def _table_shape(array: np.ndarray, name: str) -> tuple[int, int]:
-    if array.ndim != 2 or array.shape[1] == 0 or array.dtype.kind not in "fiu":
+    if array.ndim != 2 or array.shape[1] == 0 or array.dtype.kind not in "bfiu":
         raise DataError(
             f"{name} holds {array.dtype} {array.shape}; expected real numbers of shape (N, D), one point "
-            "per row."
+            "per row. Convert objects first: np.asarray(points, dtype=float)."
         )
     return array.shape[0], array.shape[1]
 

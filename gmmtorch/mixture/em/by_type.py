@@ -32,7 +32,7 @@ from gmmtorch.mixture.em.exact import Parameters
 
 _MOST_LOST = 1e-6  # nats a dimension that the log-density of the linear form may lose
 _MOST_LOST_VARIANCE = 1e-5  # share of a variance that the moments of the linear form may lose
-_ROWS = (512, 1 << 16)  # points of a product of the direct form, on a CPU and elsewhere
+_ROWS = 1024  # points of a product of the direct form on a CPU
 FEW_DIMENSIONS = 3  # up to which all types take the E-step of `exact`, whose kernels are the fastest
 _NO_SHARE = 1e-16  # of the largest responsibility of a component in a chunk: such points do not count
 
@@ -164,8 +164,10 @@ class Factors:
 
         def joint(points: Tensor, square: Tensor | None = None) -> Tensor:
             points = points @ self.whiten.mT if self.kind == "tied" else points
-            most = chunk_elements(points.device)
-            rows = max(64, min(_ROWS[points.device.type != "cpu"], most // dim))
+            # Large products of full covariances gain more from their size than they lose in the cache.
+            on_cpu, most = points.device.type == "cpu", chunk_elements(points.device)
+            most *= 2 if on_cpu and self.kind == "full" and dim > 100 else 1
+            rows = max(64, min(_ROWS if on_cpu else 1 << 16, most // dim))
             found = []
             for some in points.split(rows):
                 n = max(1, most // (rows * width))
