@@ -29,6 +29,7 @@ from gmmtorch.localization.pose_search import (
     CORRELATED,
     MARGIN,
     NEVER,
+    WIDE,
     Expectation,
     PoseSearch,
     free_segments,
@@ -58,7 +59,7 @@ _COARSE_POINTS = 300  # of the scan on all levels but the last one
 _RANKED = 200  # points of the scan that rank the starts
 _LOOSEST = 0.3  # metres of standard deviation
 LOST = 1.0, math.radians(20)  # deviations (m, rad) of a pose that no scan confirms
-_STARTS = 40  # poses of the search in 2D that are climbed
+_STARTS, _STARTS_WIDE = 40, 100  # poses of the search in 2D that are climbed, and of the wide one
 _SEARCHED = 1000  # points of a keyframe
 _APART = 0.3  # metres, and radians: poses are different
 _UNKNOWN = 4.0  # nats of a point that the local map could not see: neither for nor against a pose
@@ -68,6 +69,7 @@ _LEAST_OF_SURPRISING = 0.8  # the same, of a pose that has against it, by what w
 _SURPRISING = 4.0  # nats or more
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
+_SURE = 4.6  # nats: odds of 100 to 1
 _ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -130,11 +132,14 @@ class LocalMap:
         for starts, targets in self._searches(scan, expected):
             tried = self._climbed(scan, expected, starts, targets)
             confirmed = False  # by another search that found the same pose
-            if best is not None and best.location.found:
+            if best is None:
+                best = tried
+            elif best.location.found:
                 before, now = (Pose.from_matrix(one.location.pose[None]) for one in (best, tried))
                 confirmed = float(differences(before, now, _APART, _APART)) < 1
-            if best is None or (tried.location.found, tried.total) > (best.location.found, best.total):
-                best = tried
+            # A lost scan stays where the first search finds it: that is near the prediction.
+            is_better = tried.location.found and (not best.location.found or tried.total > best.total)
+            best = tried if is_better else best
             supported = best.location.explained - best.contradicted
             if best.location.found and (confirmed or supported >= _USUAL * expected.explained):
                 break
@@ -150,7 +155,11 @@ class LocalMap:
         starts = self._lattice(scan, near, near.poses, first, spacing, 2 * near.angle, _CLIMBED[0])
         if self.dim == 2:
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
-            yield Pose.cat([starts, self._search.best(scan.points, expected, _STARTS)[0]]), self._targets
+            starts = Pose.cat([starts, self._search.best(scan.points, expected, _STARTS)[0]])
+            yield starts, self._targets
+            # How sure a pose is depends on all others, so the first starts stay.
+            wide = self._search.best(scan.points, expected, _SORTED[2], *WIDE)[0]
+            yield Pose.cat([starts, self._ranked(scan, expected, wide)[:_STARTS_WIDE]]), self._targets
             return
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))
@@ -170,6 +179,48 @@ class LocalMap:
             mixture, self._components, Pose(turned, last.translation.expand(_HEADINGS, 3)).matrix
         )
         yield Pose.from_matrix(found.transform[None]), self._targets
+
+    def placed(self, scans: Sequence[Keyframe], expected: Expectation) -> tuple[list[Location], bool]:
+        """Where some scans in 2D, whose poses agree with each other, most likely lie together; the locations
+        have a doubt if a scan does not support it. And whether this is sure: other places, and one that this
+        map does not show, are less likely by odds of 100.
+
+        expected: pose of the first scan. Each other pose in its reach is a chance to be wrong.
+        """
+        first = scans[0].pose.inverse()
+        ways = [first @ one.pose for one in scans]
+        cloud = torch.cat(
+            [way.apply(one.points[:_COARSE_POINTS]) for way, one in zip(ways, scans, strict=True)]
+        )
+        cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[:_COARSE_POINTS]]
+        # Fewer points leave more poses in the reach of the margin of the search.
+        firsts = self._search.best(cloud[:_RANKED], expected, _SORTED[2], *WIDE)[0]
+        rough = sum(self._rough(one, firsts @ way) for way, one in zip(ways, scans, strict=True))
+        rough = rough - expected.unlikely(firsts)
+        firsts = firsts[rough.argsort(descending=True, stable=True)[:_STARTS_WIDE]]
+        for target in self._targets[:2]:
+            climbed = align(cloud, target, firsts.shifted(-self._center), _STEPS)
+            firsts = climbed.motions.orthonormal().shifted(self._center)
+        flat, nats = expected._replace(distance=math.inf, angle=math.inf, max_step=math.inf), []
+        for way, one in zip(ways, scans, strict=True):
+            points, places = one.points[:_COARSE_POINTS], (firsts @ way).shifted(-self._center)
+            found = align(points, self._targets[1], places, _SLIDE_STEPS)
+            nats.append(self._total(found, points, flat)[0] - _UNKNOWN * len(points) / CORRELATED)
+        total = torch.stack(nats).sum(0) - expected.unlikely(firsts)
+        best = int(total.argmax())
+        is_apart = differences(firsts, firsts[[best]], _APART, _APART)[:, 0] > 1
+        lead = float(total[best] - torch.where(is_apart, total, -torch.inf).amax())
+        n_poses = math.pi * (expected.max_step / _APART) ** 2 * expected.max_turn / _APART
+        is_sure = lead > _SURE and float(total[best]) > _SURE + math.log(n_poses)
+        laid = align(cloud, self._targets[-1], firsts[[best]].shifted(-self._center), _STEPS).motions
+        locations = []
+        for way, one, gain in zip(ways, scans, nats, strict=True):
+            place = laid.orthonormal().shifted(self._center) @ way
+            seen = align(one.points, self._targets[-1], place.shifted(-self._center), 0)
+            covariance = pose_covariance(seen.information[0], one.points)[0]
+            doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
+            locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
+        return locations, is_sure
 
     def _lattice(
         self,
@@ -195,16 +246,32 @@ class LocalMap:
         rotations = (turns @ centers.rotation[:, None, None]).expand(-1, len(shifts), -1, -1, -1)
         places = (centers.translation[:, None] + shifts)[:, :, None].expand(-1, -1, len(turns), -1)
         starts = Pose.cat([centers, Pose(rotations.flatten(0, 2), places.flatten(0, 2))])
-        points = scan.points[:_RANKED]
-        score = target.scores(points, starts.shifted(-self._center))
-        total = score / CORRELATED - expected.unlikely(starts)
-        best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
-        view = self._space.view(points, starts[best])
-        against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
-        total = total[best] - against * len(points) / CORRELATED
-        starts = starts[best[total.argsort(descending=True, stable=True)]]
+        starts = self._ranked(scan, expected, starts, target)
         starts = starts[distinct(starts.shifted(-self._center), _SPREAD * spacing, _SPREAD * turn)]
         return Pose.cat([centers, starts[:most]])
+
+    def _ranked(
+        self, scan: Keyframe, expected: Expectation, starts: Pose, target: AlignmentTarget | None = None
+    ) -> Pose:
+        """The best starts, best first."""
+        points = scan.points[:_RANKED]
+        score = (target or self._targets[0]).scores(points, starts.shifted(-self._center))
+        total = score / CORRELATED - expected.unlikely(starts)
+        best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
+        total = total[best] - self._against(points, starts[best])
+        return starts[best[total.argsort(descending=True, stable=True)]]
+
+    def _rough(self, scan: Keyframe, poses: Pose) -> Tensor:
+        """Nats (B,) of a scan at poses from which it has not climbed, against a place that is not shown."""
+        points = scan.points[:_RANKED]
+        score = self._targets[0].scores(points, poses.shifted(-self._center))
+        return (score - _UNKNOWN * len(points)) / CORRELATED - self._against(points, poses)
+
+    def _against(self, points: Tensor, poses: Pose) -> Tensor:
+        """Nats (B,) by which free space contradicts points at poses, less those of unseen points."""
+        view = self._space.view(points, poses)
+        mean = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
+        return mean * len(points) / CORRELATED
 
     def _climbed(
         self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]

@@ -47,6 +47,8 @@ MARGIN = 0.25, 0.02
 """Metres, and share of the range, that a point may be in front of or behind a surface."""
 _FIRST = 50  # best squares, which are divided first, for a score to compare with
 _BELOW = 12.0  # nats below the best score that are kept: refinement may turn the order
+WIDE = _KEPT_ANYWHERE, 30.0
+"""Squares of a level, and nats below the best score, of a second search, which takes longer."""
 _PLACES = 6  # times as many poses of different places, from which those that differ are chosen
 _TOLD_APART = 0.3, math.radians(8)  # metres and radians between poses that are returned
 
@@ -167,12 +169,15 @@ class PoseSearch:
         unknown = Expectation(level, math.inf, math.inf, 1.0, reach)
         return self.best(points, unknown, most, _KEPT_ANYWHERE)
 
-    def best(self, points: Tensor, expected: Expectation, most: int, kept: int = _KEPT) -> Found:
+    def best(
+        self, points: Tensor, expected: Expectation, most: int, kept: int = _KEPT, below: float = _BELOW
+    ) -> Found:
         """The best poses that differ, at most `most`, as far from the last expected pose as a scan can be.
 
         Args:
             points: (N, 2) of the scan, sensor frame, in random order; the first ones are used.
-            kept: squares of a level, at most, which are divided.
+            kept: squares of a level, at most, which are divided. below: nats below the best score, to which
+                they are.
         """
         tried = self._tried(points.double(), expected)
         level = self._first_level(expected.max_step)
@@ -193,12 +198,12 @@ class PoseSearch:
             some, at, dived = some[best], at[best], score[best]
         least = float(dived[0])
         for finer in range(level - 1, -1, -1):
-            rows = _most(bound, least - _BELOW, kept)
+            rows = _most(bound, least - below, kept)
             heading, shift = _divided(heading[rows], shift[rows], 1 << finer)
             bound = self._scored(tried, heading, shift, finer)
         # Where more squares than `kept` may hold a better pose, the first ones may not be among them.
         heading, shift, bound = torch.cat([heading, some]), torch.cat([shift, at]), torch.cat([bound, dived])
-        rows = _most(bound, float(bound.max()) - _BELOW, kept)
+        rows = _most(bound, float(bound.max()) - below, kept)
         return self._told_apart(tried, heading[rows], shift[rows], bound[rows], most)
 
     def _tried(self, points: Tensor, expected: Expectation) -> _Tried:
