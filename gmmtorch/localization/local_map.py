@@ -69,7 +69,6 @@ _LEAST_OF_SURPRISING = 0.8  # the same, of a pose that has against it, by what w
 _SURPRISING = 4.0  # nats or more
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
-_SURE = 4.6  # nats: odds of 100 to 1
 _ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -180,48 +179,6 @@ class LocalMap:
         )
         yield Pose.from_matrix(found.transform[None]), self._targets
 
-    def placed(self, scans: Sequence[Keyframe], expected: Expectation) -> tuple[list[Location], bool]:
-        """Where some scans in 2D, whose poses agree with each other, most likely lie together; the locations
-        have a doubt if a scan does not support it. And whether this is sure: other places, and one that this
-        map does not show, are less likely by odds of 100.
-
-        expected: pose of the first scan. Each other pose in its reach is a chance to be wrong.
-        """
-        first = scans[0].pose.inverse()
-        ways = [first @ one.pose for one in scans]
-        cloud = torch.cat(
-            [way.apply(one.points[:_COARSE_POINTS]) for way, one in zip(ways, scans, strict=True)]
-        )
-        cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[:_COARSE_POINTS]]
-        # Fewer points leave more poses in the reach of the margin of the search.
-        firsts = self._search.best(cloud[:_RANKED], expected, _SORTED[2], *WIDE)[0]
-        rough = sum(self._rough(one, firsts @ way) for way, one in zip(ways, scans, strict=True))
-        rough = rough - expected.unlikely(firsts)
-        firsts = firsts[rough.argsort(descending=True, stable=True)[:_STARTS_WIDE]]
-        for target in self._targets[:2]:
-            climbed = align(cloud, target, firsts.shifted(-self._center), _STEPS)
-            firsts = climbed.motions.orthonormal().shifted(self._center)
-        flat, nats = expected._replace(distance=math.inf, angle=math.inf, max_step=math.inf), []
-        for way, one in zip(ways, scans, strict=True):
-            points, places = one.points[:_COARSE_POINTS], (firsts @ way).shifted(-self._center)
-            found = align(points, self._targets[1], places, _SLIDE_STEPS)
-            nats.append(self._total(found, points, flat)[0] - _UNKNOWN * len(points) / CORRELATED)
-        total = torch.stack(nats).sum(0) - expected.unlikely(firsts)
-        best = int(total.argmax())
-        is_apart = differences(firsts, firsts[[best]], _APART, _APART)[:, 0] > 1
-        lead = float(total[best] - torch.where(is_apart, total, -torch.inf).amax())
-        n_poses = math.pi * (expected.max_step / _APART) ** 2 * expected.max_turn / _APART
-        is_sure = lead > _SURE and float(total[best]) > _SURE + math.log(n_poses)
-        laid = align(cloud, self._targets[-1], firsts[[best]].shifted(-self._center), _STEPS).motions
-        locations = []
-        for way, one, gain in zip(ways, scans, nats, strict=True):
-            place = laid.orthonormal().shifted(self._center) @ way
-            seen = align(one.points, self._targets[-1], place.shifted(-self._center), 0)
-            covariance = pose_covariance(seen.information[0], one.points)[0]
-            doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
-            locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
-        return locations, is_sure
-
     def _lattice(
         self,
         scan: Keyframe,
@@ -258,20 +215,10 @@ class LocalMap:
         score = (target or self._targets[0]).scores(points, starts.shifted(-self._center))
         total = score / CORRELATED - expected.unlikely(starts)
         best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
-        total = total[best] - self._against(points, starts[best])
+        view = self._space.view(points, starts[best])
+        against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
+        total = total[best] - against * len(points) / CORRELATED
         return starts[best[total.argsort(descending=True, stable=True)]]
-
-    def _rough(self, scan: Keyframe, poses: Pose) -> Tensor:
-        """Nats (B,) of a scan at poses from which it has not climbed, against a place that is not shown."""
-        points = scan.points[:_RANKED]
-        score = self._targets[0].scores(points, poses.shifted(-self._center))
-        return (score - _UNKNOWN * len(points)) / CORRELATED - self._against(points, poses)
-
-    def _against(self, points: Tensor, poses: Pose) -> Tensor:
-        """Nats (B,) by which free space contradicts points at poses, less those of unseen points."""
-        view = self._space.view(points, poses)
-        mean = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
-        return mean * len(points) / CORRELATED
 
     def _climbed(
         self, scan: Keyframe, expected: Expectation, starts: Pose, targets: list[AlignmentTarget]

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.alignment import chosen_rows
 from gmmtorch.localization.local_map import Keyframe, LocalMap
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.pose_graph import Edges, optimised
@@ -26,8 +25,6 @@ _REACH = 3.0  # metres between the places of a closure, and
 _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
 _FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
-_LAID = 4  # successive keyframes that are laid together into another map, at most
-_LAYS = 4  # sets of them
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
 _SPACING = 3  # every third keyframe looks for closures
 _MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
@@ -66,16 +63,9 @@ def closed(
             the sensor was lost, and the poses of one relative to the other are a guess.
     """
     tried: set[tuple[int, int]] = set()
-    numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     closures: list[_Closure] = []
-    if poses.dim == 2 and len(parts):
-        joined = _Parts(poses, places, parts, least_explained, rule)
-        joined.join()
-        poses, parts, closures = joined.poses, joined.parts, joined.closures
-    if closures:
-        edges = edges.joined(_edges(closures))
-        poses = optimised(poses, edges, with_covariances=False).poses
-    begins = _begins(numbers, parts)
+    numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
+    begins = numbers[1:][parts[1:] != parts[:-1]]
     for _ in range(_ROUNDS):
         at = poses.translation[numbers]
         pairs = [pair for pair in _candidates(at, parts=parts) if pair not in tried]
@@ -91,103 +81,6 @@ def closed(
         edges = edges.joined(_edges(found))
         poses = optimised(_put_together(poses, closures, begins), edges, with_covariances=False).poses
     return poses, edges
-
-
-class _Parts:
-    """Parts of a trajectory in 2D, which become one where their keyframes lie together.
-
-    Args: as for `closed`.
-    """
-
-    def __init__(
-        self,
-        poses: Pose,
-        places: Sequence[tuple[int, Keyframe]],
-        parts: Tensor,
-        least_explained: float,
-        rule: WindowedRule,
-    ) -> None:
-        self.poses, self.parts, self.closures = poses, parts.clone(), list[_Closure]()
-        self._places, self._least_explained, self._rule = places, least_explained, rule
-        self._numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
-        self._scans = torch.bucketize(torch.arange(len(poses)), _begins(self._numbers, parts), right=True)
-        steps = (poses.translation[1:] - poses.translation[:-1]).norm(dim=1)
-        self._steps = steps[self._scans[1:] == self._scans[:-1]]
-
-    def join(self) -> None:
-        """First at the loss between two successive parts, then anywhere."""
-        for part in self.parts.unique().tolist()[1:]:
-            new = self._rows(part)
-            old = self._rows(int(self.parts[new[0] - 1]))[-2 * _NEIGHBOURS - 1 :]
-            n = max(min(_LAID // 2, len(new) // 2), 1)
-            last, first = int(self._numbers[old[-1]]), int(self._numbers[new[0]])
-            usual, most = float(self._steps.square().mean().sqrt()), float(self._steps.amax())
-            reach = max(most, _REACH) * (first - last)
-            expected = Expectation(self.poses[[last]], usual * (first - last), math.pi, 1.0, reach, math.pi)
-            self._join(old, [new[row : row + n] for row in range(0, min(len(new), 3 * n), n)], expected)
-        for part in self.parts.unique().tolist()[1:]:
-            for other in self.parts.unique().tolist():
-                old, new = self._rows(other), self._rows(part)
-                if other >= part or len(old) < _SPACING or len(new) < 2:
-                    continue
-                at = self.poses.translation[self._numbers[old]]
-                middle = Pose(torch.eye(2).double()[None], at.mean(0, keepdim=True))
-                reach = float((at - middle.translation).norm(dim=1).amax()) + _FARTHEST
-                anywhere = Expectation(middle, math.inf, math.inf, 1.0, reach, math.pi)
-                n = min(_LAID, len(new) // 2)
-                some = range(0, len(new) - n + 1, max(n, math.ceil(len(new) / _LAYS)))
-                if self._join(old, [new[row : row + n] for row in some], anywhere):
-                    break
-
-    def _join(self, old: list[int], sets: list[list[int]], expected: Expectation) -> bool:
-        """Makes a part one with that of some old keyframes, if sets of its keyframes lie there and two of
-        them, of which one is sure, agree."""
-        local = LocalMap([self._frame(row) for row in old], self._least_explained, self._rule)
-        before: list[tuple[list[_Closure], bool]] = []
-        for new in sets:
-            located, is_sure = local.placed([self._frame(row) for row in new], expected)
-            found = [
-                self._closure(old, row, location)
-                for row, location in zip(new, located, strict=True)
-                if location.found
-            ]
-            for other, was_sure in before if found else []:
-                if (is_sure or was_sure) and _agree(self.poses, other[0], found[0]):
-                    self._unite(other + found)
-                    return True
-            if found:
-                before.append((found, is_sure))
-        return False
-
-    def _frame(self, row: int) -> Keyframe:
-        return self._places[row][1]._replace(pose=self.poses[int(self._numbers[row])])
-
-    def _closure(self, old: list[int], row: int, location: Location) -> _Closure:
-        pose = Pose.from_matrix(location.pose)
-        gaps = (self.poses.translation[self._numbers[old]] - pose.translation).norm(dim=1)
-        source = int(self._numbers[old[int(gaps.argmin())]])
-        motion = self.poses[source].inverse() @ pose
-        return _Closure(source, int(self._numbers[row]), motion, information_of(location))
-
-    def _unite(self, closures: list[_Closure]) -> None:
-        """Moves a part to where closures with another one say, and makes both one."""
-        source, target, motion, _ = closures[0]
-        moved = self.poses[source] @ motion @ self.poses[target].inverse() @ self.poses
-        other, part = int(self._scans[source]), int(self._scans[target])
-        is_moved = self._scans == part
-        self.poses = Pose(*chosen_rows(is_moved, moved.parts, self.poses.parts))
-        self._scans[is_moved], self.parts[self.parts == part] = other, other
-        self.closures += closures
-
-    def _rows(self, part: int) -> list[int]:
-        """The keyframes of a part."""
-        rows: list[int] = (self.parts == part).nonzero()[:, 0].tolist()
-        return rows
-
-
-def _begins(numbers: Tensor, parts: Tensor) -> Tensor:
-    """Poses (P − 1,) that begin a part but the first one, by the numbers (K,) and parts of keyframes."""
-    return numbers[1:][parts[1:] != parts[:-1]]
 
 
 def _put_together(poses: Pose, closures: Sequence[_Closure], begins: Tensor) -> Pose:

@@ -32,9 +32,7 @@ _STORED = 4000  # points of a keyframe
 _KEYFRAMES = 10  # in the local map,
 _MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
 _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
-_GIVEN_UP = 3  # lost scans in a row, after which the sensor may have stopped
-_DOUBTED = 0.5  # probability of a pose after a lost scan, below which both may begin a new local map
-_BEGUN = 0.8  # least probability of a pose in a new local map
+_GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
 _ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
 _LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
 _APART = "the sensor was lost before, and no place that it saw later is known from before"
@@ -78,8 +76,8 @@ class Odometry:
     the scan's own mixture is registered (`localization.registration`); if the points do not support the best
     pose, from a wider lattice and from other headings. `trajectory` finds the places that were seen twice and
     corrects all poses by a pose graph (`localization.pose_graph`). A scan that is not found never enters the
-    local map. If the next one is found, it is searched for again. If the next one is found in a map of the
-    lost one only, this is a new map, whose poses are found if two closures that agree join it with the first.
+    local map. If the next one is found, it is searched for again. The fourth in a row begins a new map, whose
+    poses are found if two closures that agree join it with the first.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -284,29 +282,7 @@ class Odometry:
             return Location(guess.matrix, nowhere(last.dim), 0.0, (doubt,))
         location = self._local.locate(scan, expected)
         self._note_surprise(location, expected)
-        if not self._lost or (location.found and location.probability >= _DOUBTED):
-            return location
-        return self._begun(scan) or location
-
-    def _begun(self, scan: Keyframe) -> Location | None:
-        """The pose of a scan in a new map of the last scan, which was lost; None if it is not found there."""
-        if len(self._lost[-1].points) < _FEWEST:
-            return None
-        number, first = len(self._poses) - 1, self._lost[-1]._replace(pose=self._poses[-1])
-        local = LocalMap([first], self.least_explained, self.rule, self.n_points)
-        near = Expectation(first.pose[None], *_FIRST_STEP, self._explained, self.max_step, self.max_turn)
-        found = local.locate(scan, near)
-        if not found.found or found.probability < _BEGUN:
-            return None
-        # A closure decides where the new map is, not the guess.
-        anywhere = replace(self._locations[-1], covariance=nowhere(first.pose.dim, *_ANYWHERE))
-        since = self._poses[self._last_frame].inverse() @ first.pose
-        self._edges[-1] = (self._last_frame, since, information_of(anywhere))
-        self._locations[-1] = replace(found, pose=first.pose.matrix)
-        self._parts.append(len(self.keyframes))
-        self._lost, self._last_found, self._surprise = [], number, _FIRST_STEP
-        self._keep(number, first)
-        return found
+        return location
 
     def _predicted(self, measured: Pose | Tensor | None, ratio: float) -> tuple[Pose, Pose]:
         """The motion since the last scan, and that of a sensor that stopped."""
@@ -350,25 +326,25 @@ class Odometry:
             self._lost = []
         else:
             lost.append(scan)
-        is_first = self._local is None and len(scan.points) >= _FEWEST
-        if is_first:
-            self._parts.append(0)
-            self._lost, self._last_found = [], number
-        if is_first or (location.found and self._is_new(pose)):
-            self._keep(number, scan._replace(pose=pose))
+        begins = self._local is None or len(self._lost) > _GIVEN_UP
+        is_new = begins or (location.found and self._is_new(pose))
+        if is_new and len(scan.points) >= _FEWEST:
+            if begins:
+                if self._edges:  # a closure decides where the new map is, not the guess
+                    anywhere = replace(location, covariance=nowhere(pose.dim, *_ANYWHERE))
+                    self._edges[-1] = (*self._edges[-1][:2], information_of(anywhere))
+                self._parts.append(len(self.keyframes))
+                self._lost, self._last_found = [], number
+            self._last_frame = number
+            self._frames.append(number)
+            self.keyframes.append(scan._replace(pose=pose))
+            if self.n_keyframes is None:
+                directions = torch.nn.functional.normalize(scan.points, dim=1)
+                is_narrow = float(directions.mean(0).norm()) > _NARROW
+                self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
+            self._set_local_map(self.n_keyframes)
         if location.found and len(lost) == 1:
             self._search_again(lost[0])
-
-    def _keep(self, number: int, scan: Keyframe) -> None:
-        """Makes a scan a keyframe."""
-        self._last_frame = number
-        self._frames.append(number)
-        self.keyframes.append(scan)
-        if self.n_keyframes is None:
-            directions = torch.nn.functional.normalize(scan.points, dim=1)
-            is_narrow = float(directions.mean(0).norm()) > _NARROW
-            self.n_keyframes = _MANY_KEYFRAMES if is_narrow else _KEYFRAMES
-        self._set_local_map(self.n_keyframes)
 
     def _search_again(self, scan: Keyframe) -> None:
         """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans

@@ -12,7 +12,7 @@ from localization.looping_robot import ANGLES, BACK, DriftingOdometry, lap
 from scipy.optimize import least_squares
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.localization import Odometry, absolute_trajectory_error, loop_closure
+from gmmtorch.localization import Odometry, loop_closure
 from gmmtorch.localization.local_map import nowhere
 from gmmtorch.localization.loop_closure import _Closure, _edges, _put_together
 from gmmtorch.localization.odometry import _ANYWHERE
@@ -236,19 +236,3 @@ def test_two_closures_that_agree_move_a_map_that_began_after_the_sensor_was_lost
     assert odometry._is_apart(edges.at(used)).tolist() == [False] * 4 + [not is_joined] * 4
     if is_joined:
         assert float((best.poses.translation - true.translation).norm(dim=1).max()) < 0.01
-
-
-@pytest.mark.parametrize("is_elsewhere", [False, True])
-def test_a_map_that_begins_after_the_sensor_was_carried_is_joined_where_it_lies(is_elsewhere):
-    messages, true = lap(42)
-    scans = [points(message) for message in messages]
-    carried = [*range(24), *range(6, 18)]  # back by six metres, beyond what a step reaches
-    odometry = Odometry(max_step=1.0)
-    for step, number in enumerate(carried):
-        odometry.add(5.0 * scans[number] if is_elsewhere and step >= 24 else scans[number])
-    found = odometry.trajectory()
-    assert len(odometry._parts) > 1
-    assert found.found.tolist() == [True] * 24 + [not is_elsewhere] * 12
-    if not is_elsewhere:
-        errors = absolute_trajectory_error(found.poses, true[carried], align="first").distances
-        assert float(errors.max()) < 0.05
