@@ -125,20 +125,25 @@ class LocalMap:
         origins = torch.cat([scan.origin.expand_as(scan.points[:_SEARCHED]) for scan in self._scans])
         return PoseSearch(points, free_segments(origins, points))
 
-    def locate(self, scan: Keyframe, expected: Expectation) -> Location:
-        """The pose of a scan, whose own pose is not used; `found` if it is sure."""
+    def locate(self, scan: Keyframe, expected: Expectation, wide: bool = False) -> Location:
+        """The pose of a scan, whose own pose is not used; `found` if it is sure.
+
+        wide: search wider in 2D if the first search fails. Where little is expected, as after a lost scan, a
+            wider search finds more wrong poses that fit by chance.
+        """
         best: _Found | None = None
-        for starts, targets in self._searches(scan, expected):
+        for starts, targets in self._searches(scan, expected, wide):
             tried = self._climbed(scan, expected, starts, targets)
             confirmed = False  # by another search that found the same pose
-            if best is None:
-                best = tried
-            elif best.location.found:
+            if best is not None and best.location.found:
                 before, now = (Pose.from_matrix(one.location.pose[None]) for one in (best, tried))
                 confirmed = float(differences(before, now, _APART, _APART)) < 1
-            # A lost scan stays where the first search finds it: that is near the prediction.
-            is_better = tried.location.found and (not best.location.found or tried.total > best.total)
-            best = tried if is_better else best
+            # In 2D a lost scan stays where the first search finds it: that is near the prediction.
+            counts = tried.location.found or self.dim == 3
+            if best is None or (
+                counts and (tried.location.found, tried.total) > (best.location.found, best.total)
+            ):
+                best = tried
             supported = best.location.explained - best.contradicted
             if best.location.found and (confirmed or supported >= _USUAL * expected.explained):
                 break
@@ -146,7 +151,7 @@ class LocalMap:
         return best.location
 
     def _searches(
-        self, scan: Keyframe, expected: Expectation
+        self, scan: Keyframe, expected: Expectation, wide: bool
     ) -> Iterator[tuple[Pose, list[AlignmentTarget]]]:
         """Starts, and the levels they climb; the cheapest search first."""
         near = expected._replace(distance=min(expected.distance, _NEAR), angle=min(expected.angle, _NEAR / 2))
@@ -156,9 +161,9 @@ class LocalMap:
             # Along a wall most climbs end in one wrong place: the best pose of the raster is not enough.
             starts = Pose.cat([starts, self._search.best(scan.points, expected, _STARTS)[0]])
             yield starts, self._targets
-            # How sure a pose is depends on all others, so the first starts stay.
-            wide = self._search.best(scan.points, expected, _SORTED[2], *WIDE)[0]
-            yield Pose.cat([starts, self._ranked(scan, expected, wide)[:_STARTS_WIDE]]), self._targets
+            if wide:  # How sure a pose is depends on all others, so the first starts stay.
+                more = self._search.best(scan.points, expected, _SORTED[2], *WIDE)[0]
+                yield Pose.cat([starts, self._ranked(scan, expected, more)[:_STARTS_WIDE]]), self._targets
             return
         still = Scan(scan.points, torch.zeros(self.dim))
         mixture = learn_window([still], self._rule, torch.Generator().manual_seed(0))

@@ -280,7 +280,7 @@ class Odometry:
         if is_empty or self._local is None:
             doubt = "the scan has too few points" if is_empty else "no scan before had points"
             return Location(guess.matrix, nowhere(last.dim), 0.0, (doubt,))
-        location = self._local.locate(scan, expected)
+        location = self._local.locate(scan, expected, wide=not self._lost)
         self._note_surprise(location, expected)
         return location
 
