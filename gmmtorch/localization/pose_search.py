@@ -27,7 +27,7 @@ CORRELATED = 10.0
 HIT, UNKNOWN, FREE = 8.0, 4.0, -8.0
 """Nats of a point on a surface, where nothing was seen, and in free space."""
 
-_CELLS = 1 << 18  # of a raster at most
+_CELLS, _CELLS_ANYWHERE = 1 << 18, 1 << 20  # of a raster at most, and of that of a whole map
 _FINEST = 0.1  # metres of a cell
 _BLUR = 1.5  # cells of standard deviation of a surface
 _ROUNDING = 1e-6  # radians
@@ -109,14 +109,16 @@ class PoseSearch:
     Args:
         points: (N, 2) on the surfaces, world frame, metres; at least one.
         free: (M, 2, 2) segments through free space; none: cells away from surfaces are unknown.
-        cell: side (m) of a cell; it is larger where the raster would have too many cells.
+        cell: side (m) of a cell; it is larger where the raster would have more than `most` cells.
     """
 
-    def __init__(self, points: Tensor, free: Tensor | None = None, cell: float | None = None) -> None:
+    def __init__(
+        self, points: Tensor, free: Tensor | None = None, cell: float | None = None, most: int = _CELLS
+    ) -> None:
         low, high = points.amin(0), points.amax(0)
         side = _FINEST if cell is None else cell
-        while (volume := math.prod(((high - low) / side + 1).tolist())) > _CELLS:
-            side *= 1.01 * (volume / _CELLS) ** 0.5
+        while (volume := math.prod(((high - low) / side + 1).tolist())) > most:
+            side *= 1.01 * (volume / most) ** 0.5
         self.cell = side
         margin = 1 << _LEVELS
         self._low = (low / side).floor() - margin
@@ -158,7 +160,7 @@ class PoseSearch:
         ends = (means[by] + parts[:, None, None] * along[by]).flatten(0, 1)
         origins = (components.origins.double()[components.seen_from] - center).repeat(len(parts), 1)
         free = free_segments(origins, ends, components.max_range[by].repeat(len(parts)))
-        return cls(means[component] + offset[:, None] * along[component], free)
+        return cls(means[component] + offset[:, None] * along[component], free, most=_CELLS_ANYWHERE)
 
     def anywhere(self, points: Tensor, most: int) -> Found:
         """The best poses in the whole raster that differ, at most `most`; arguments as of `best`."""
