@@ -227,12 +227,14 @@ def test_other_robots_cannot_fill_the_memory_with_labels_and_channels(monkeypatc
     attacker, robot = Replica(0), Replica(1)
     monkeypatch.setattr(attacker._records, "fitting", lambda components: components)
     labels = [Labels(torch.eye(9).double(), torch.arange(9) + 9 * n) for n in range(4)]
+    sent = []
     for number, one in enumerate(labels):
         attacker.add(with_channel(one))
+        sent += attacker.datagrams()
         attacker.add(with_channel(numbers(1), f"x{number}"))
     for number in range(20):
         attacker.add(with_channel(numbers(1), f"y{number}"))
-    for datagram in attacker.datagrams():
+    for datagram in sent + attacker.datagrams():
         assert robot.receive(datagram)
     found = robot.components()
     assert len(found) == 28 * 9

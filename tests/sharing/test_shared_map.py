@@ -36,7 +36,7 @@ def test_robots_hold_the_components_of_all_although_datagrams_are_lost():
         before = shared.content()
         shared.replica.publish(components, whole=True)
         assert shared.content() != before
-    exchanged(team, 0.0)
+    exchanged(team, 0.0, n_rounds=200)
     assert network.reception().lost > 0
     assert team[0].replica.digest() == team[1].replica.digest()
     for shared in team:
