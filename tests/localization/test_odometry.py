@@ -125,10 +125,10 @@ def test_a_lost_scan_is_searched_for_again_when_the_next_one_is_found(monkeypatc
     scans, true = sensor_scans("synthetic_building_2d", 8)
     locate, n_calls = LocalMap.locate, 0
 
-    def missed(local, scan, expected):
+    def missed(local, scan, expected, wide=False):
         nonlocal n_calls
         n_calls += 1
-        location = locate(local, scan, expected)
+        location = locate(local, scan, expected, wide)
         return (
             replace(location, pose=expected.poses[0].matrix, doubts=("missed",)) if n_calls == 4 else location
         )

@@ -108,7 +108,6 @@ def test_components_equal_those_of_datagrams_at_all_robots():
     assert_same_components(one.components(), other.components())
 
 
-
 def test_a_component_without_points_gains_them_evenly():
     one = Replica(0)
     bare = random_components(3, k=1, seed=3, n_origins=4, max_sightings=1)
