@@ -38,15 +38,18 @@ def errors(pose: Tensor, truth: Tensor) -> tuple[float, float]:
     return float((pose[:dim, dim] - truth[:dim, dim]).norm()), angle
 
 
-@pytest.fixture(scope="module")
-def building():
-    """Scans of the flat building with their poses, and a map of all but every fifth."""
-    scans = gt.datasets.load("synthetic_building_2d", n_scans=240)
-    m = gt.GaussianMap()
+def held_out(name: str, n_scans: int) -> tuple[gt.datasets.Dataset, gt.GaussianMap]:
+    """Scans with their poses, and a map of all but every fifth."""
+    scans, m = gt.datasets.load(name, n_scans=n_scans), gt.GaussianMap()
     for number, scan in enumerate(scans):
         if number % 5:
             m.insert(scan)
     return scans, m
+
+
+@pytest.fixture(scope="module")
+def building():
+    return held_out("synthetic_building_2d", 240)
 
 
 def test_held_out_scans_are_found_from_half_a_metre_and_ten_degrees(building):
@@ -89,11 +92,7 @@ def test_scans_without_a_pose_are_found_right_or_not_at_all(building):
 
 def test_a_tilted_or_turned_sensor_in_space_is_found_without_a_pose():
     """Held-out scans, with the sensor upright, tilted, on its side and upside down."""
-    scans = gt.datasets.load("synthetic_building", n_scans=30)
-    m = gt.GaussianMap()
-    for number, scan in enumerate(scans):
-        if number % 5:
-            m.insert(scan)
+    scans, m = held_out("synthetic_building", 30)
     tracker = Tracker(m)
     turns = torch.tensor([[0.0, 0, 0], [0.4, 0.2, 0], [0, math.pi / 2, 1], [math.pi, 0, 0]]).double()
     for number, turn in zip((5, 10, 15, 20), turns, strict=True):

@@ -212,7 +212,6 @@ class Robot:
 _SEEDS_PER_MISSION = 1 << 10  # robot ids for which the random draws differ
 _LATEST_PLANS = 10  # A plan whose number is lower than the last one's by more comes from a restarted robot
 _RESTING_PLANS = 10  # plans of a robot at rest, of which one is sent
-_MAP_EVERY = 1  # planning periods between messages of a map: components of few frames share a datagram
 _VIEWS_EVERY = 40.0  # seconds between messages of views: many change or are removed before they are sent
 _PATIENCE = 15
 """Consecutive plans without progress after which a robot looks around. Leaving a start takes up to six."""
@@ -304,10 +303,10 @@ class Agent:
     # -- messages ---------------------------------------------------------------------------------
 
     def send_map(self, now: float) -> None:
-        """Sends what is due of the map, and announcements if they are due; less than a datagram every
-        `_MAP_EVERY` planning periods only."""
+        """Sends what is due of the map, and announcements if they are due; less than a datagram once
+        in a planning period only, so that components of several frames share it."""
         shared = self.robot.mapper.shared
-        sends_at = self._map_at + _MAP_EVERY * self.options.dynamics.duration - 1e-9
+        sends_at = self._map_at + self.options.dynamics.duration - 1e-9
         is_early = self._map_at <= now < sends_at  # if not, the clock was perhaps set back
         if not self.options.shares or (is_early and shared.waits):
             return
@@ -376,7 +375,7 @@ class Agent:
 
     def _seen_at(self, now: float) -> float:
         """When the newest of the components that are sent now was seen, at the earliest."""
-        return now - _MAP_EVERY * self.options.dynamics.duration
+        return now - self.options.dynamics.duration
 
     # -- planning ---------------------------------------------------------------------------------
 
