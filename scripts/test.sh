@@ -10,8 +10,10 @@ cd "$(dirname "$0")/.."
 .venv/bin/ruff format --check .
 find gmmtorch -name '*.h' -exec .venv/bin/clang-format --dry-run --Werror {} +
 .venv/bin/ruff check .
-.venv/bin/mypy
+.venv/bin/mypy &
+PACKAGE=$!
 .venv/bin/mypy --config-file benchmarks/mypy.ini
+wait "$PACKAGE"
 status=0
 # Each test uses one thread. A later -m replaces the first.
 .venv/bin/pytest -n auto --dist worksteal -m "not slow" "$@" || status=$?
