@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.hydra import Hydra
+from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig
 
@@ -27,6 +29,12 @@ from gmmtorch.team.cli import explore, robot, ros, team
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
+
+
+# For each configuration Hydra copies the store of all schemas, and then again each schema that it takes; and
+# it composes that of a run once more, to see whether it sets `hydra.mode`. Tests compose a thousand.
+ConfigStore.__deepcopy__ = lambda store, memo: store
+Hydra.get_mode = lambda hydra, config_name, overrides: None
 
 
 def register_schemas() -> None:
