@@ -286,7 +286,7 @@ def test_components_counts_and_views_take_few_bytes():
     counts = {(i % 3, number): 1.0 + number % 97 for i, number in enumerate(known)}
     assert sum(map(len, encode_counts(0, counts))) <= 3 * 200
     assert len(encode_counts(0, {(0, number): 8.0 for number in range(1000, 1100)})[0]) <= 40  # a run
-    assert len(encode_views(views(50))[0]) <= 9 * 50
+    assert len(encode_views(views(50))[0]) <= 7 * 50
     assert len(encode_views(views(0, 100))[0]) <= 2 * 100 + 20
     assert len(encode_views(replace(views(0), removed=Intervals.span(5, 500_000)))[0]) <= 15
 

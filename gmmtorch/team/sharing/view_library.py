@@ -18,8 +18,8 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     STAMP_TICKS,
     ViewsMessage,
     encode_views,
-    quantized_poses,
     quantized_value,
+    quantized_views,
 )
 from gmmtorch.team.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
@@ -130,7 +130,7 @@ class ViewLibrary:
     def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[int]:
         """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their keys."""
         added: list[int] = []
-        rows, worth = quantized_poses(poses).numpy(), values.detach().cpu().double().numpy()
+        rows, worth = quantized_views(poses).numpy(), values.detach().cpu().double().numpy()
         order = np.argsort(-worth, kind="stable")
         order = order[worth[order] >= max(least, 1e-6)]
         near = self.candidates().poses.numpy()
