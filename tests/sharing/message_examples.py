@@ -19,8 +19,8 @@ from gmmtorch.team.sharing.messages.datagrams import CODECS, pose_of
 from gmmtorch.team.sharing.messages.mission_messages import (
     encode_points,
     encode_views,
-    quantized_views,
     quantized_values,
+    quantized_views,
 )
 from gmmtorch.team.sharing.messages.record_messages import (
     CalibrationMessage,

@@ -15,7 +15,8 @@ from invalid_values import each_value
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, examples, frame_of_components, numbers, places, sealed, views
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mapping import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing import MAX_BYTES, PlanMessage, PointsMessage, decode, encode_plan
@@ -26,7 +27,7 @@ from gmmtorch.team.sharing.messages.component_messages import (
     encode_counts,
     fitted,
 )
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind, first_byte
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind, first_byte, make_datagram, write_keys
 from gmmtorch.team.sharing.messages.message_registry import kind_of
 from gmmtorch.team.sharing.messages.mission_messages import (
     POINTS_PER_DATAGRAM,
@@ -331,6 +332,17 @@ def test_views_are_decoded_within_their_step(n, n_removed, seed, center):
     for message in found:
         removed |= message.removed
     assert removed == sent.removed
+
+
+@pytest.mark.parametrize("far", [(1 << 64) // 10, -(1 << 64) // 10, 1 << 60])  # in decimetres
+def test_views_beyond_the_farthest_position_are_refused_without_overflow(far):
+    writer = BitWriter()
+    write_keys(writer, np.array([5]))
+    for column in (far, 0, 0, 0, 1, 0):
+        writer.column(np.array([column]))
+    writer.number(0)
+    with pytest.raises(DataError, match="farther out"):
+        decode(make_datagram(Kind.VIEWS, writer.to_bytes()))
 
 
 INVALID_VIEWS = {
