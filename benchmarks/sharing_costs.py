@@ -34,7 +34,7 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     encode_plan,
     encode_points,
     encode_views,
-    quantized_poses,
+    quantized_views,
 )
 from gmmtorch.team.sharing.messages.record_messages import (
     CorrectionMessage,
@@ -168,7 +168,7 @@ def views(n: int) -> ViewsMessage:
     poses = torch.rand(n, 4, generator=generator, dtype=torch.float64) * 40 - 20
     return ViewsMessage(
         ids=torch.stack([torch.arange(n) % 3, torch.arange(n) * 2], 1),
-        poses=quantized_poses(poses),
+        poses=quantized_views(poses),
         values=(torch.rand(n, generator=generator) * 200).half().double(),
         stamps=torch.arange(n, dtype=torch.float64) / 8,
         removed=Intervals.of(np.zeros(0, np.int64)),

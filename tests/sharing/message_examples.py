@@ -19,8 +19,8 @@ from gmmtorch.team.sharing.messages.datagrams import CODECS, pose_of
 from gmmtorch.team.sharing.messages.mission_messages import (
     encode_points,
     encode_views,
-    quantized_poses,
     quantized_values,
+    quantized_views,
 )
 from gmmtorch.team.sharing.messages.record_messages import (
     CalibrationMessage,
@@ -68,9 +68,9 @@ def views(n: int, n_removed: int = 0, seed: int = 0, center: float = 0.0) -> Vie
     poses = torch.rand(n, 4, generator=generator, dtype=torch.float64) * 40 - 20
     return ViewsMessage(
         ids=torch.stack([torch.arange(n) % 3, torch.arange(n) * 2], 1),
-        poses=quantized_poses(poses + center),
+        poses=quantized_views(poses + center),
         values=quantized_values(torch.rand(n, generator=generator) * 200),
-        stamps=torch.arange(n, dtype=torch.float64) / 10,
+        stamps=torch.arange(n, dtype=torch.float64),
         removed=Intervals.of(first_key(7) + 2 * np.arange(n_removed)),
     )
 

@@ -15,7 +15,8 @@ from invalid_values import each_value
 from mapping.random_components import random_components
 from sharing.message_examples import codecs, examples, frame_of_components, numbers, places, sealed, views
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
+from gmmtorch.mapping import BitWriter
 from gmmtorch.mapping.codec.quantization import COUNT_ERROR, MOST_POINTS, quantize, quantized
 from gmmtorch.mapping.components import Components
 from gmmtorch.team.sharing import MAX_BYTES, PlanMessage, PointsMessage, decode, encode_plan
@@ -26,7 +27,7 @@ from gmmtorch.team.sharing.messages.component_messages import (
     encode_counts,
     fitted,
 )
-from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind, first_byte
+from gmmtorch.team.sharing.messages.datagrams import FARTHEST, Kind, first_byte, make_datagram, write_keys
 from gmmtorch.team.sharing.messages.message_registry import kind_of
 from gmmtorch.team.sharing.messages.mission_messages import (
     POINTS_PER_DATAGRAM,
@@ -286,7 +287,7 @@ def test_components_counts_and_views_take_few_bytes():
     counts = {(i % 3, number): 1.0 + number % 97 for i, number in enumerate(known)}
     assert sum(map(len, encode_counts(0, counts))) <= 3 * 200
     assert len(encode_counts(0, {(0, number): 8.0 for number in range(1000, 1100)})[0]) <= 40  # a run
-    assert len(encode_views(views(50))[0]) <= 9 * 50
+    assert len(encode_views(views(50))[0]) <= 7 * 50
     assert len(encode_views(views(0, 100))[0]) <= 2 * 100 + 20
     assert len(encode_views(replace(views(0), removed=Intervals.span(5, 500_000)))[0]) <= 15
 
@@ -331,6 +332,17 @@ def test_views_are_decoded_within_their_step(n, n_removed, seed, center):
     for message in found:
         removed |= message.removed
     assert removed == sent.removed
+
+
+@pytest.mark.parametrize("far", [(1 << 64) // 10, -(1 << 64) // 10, 1 << 60])  # in decimetres
+def test_views_beyond_the_farthest_position_are_refused_without_overflow(far):
+    writer = BitWriter()
+    write_keys(writer, np.array([5]))
+    for column in (far, 0, 0, 0, 1, 0):
+        writer.column(np.array([column]))
+    writer.number(0)
+    with pytest.raises(DataError, match="farther out"):
+        decode(make_datagram(Kind.VIEWS, writer.to_bytes()))
 
 
 INVALID_VIEWS = {

@@ -110,6 +110,23 @@ def test_counter_records_stay_few():
     assert torch.allclose(found.support[order] - own, expected, rtol=0.1)
 
 
+def test_only_short_records_of_counters_are_merged():
+    one, other, rng = Replica(0), Replica(1), random.Random(0)
+    ids = [tuple(row) for row in one.add(random_components(3, k=900)).tolist()]
+    for _ in range(20):
+        one.count({name: 2.0 ** rng.randint(3, 12) for name in rng.sample(ids[20:], 40)})
+    long = one.stored()[1]
+    assert len(long) == 20
+    assert min(map(len, long)) >= 64
+    for name in ids[:20]:
+        one.count({name: 9.0})
+    found = one.stored()[1]
+    assert [datagram for datagram in found if datagram in long] == long
+    assert 2 <= len(found) - len(long) <= 18
+    exchange([one, other])
+    assert other.digest() == one.digest()
+
+
 def test_the_last_correction_of_a_scan_counts():
     one, other = Replica(0), Replica(1)
     given_ = random_components(3, k=6)

@@ -36,7 +36,7 @@ class SendOnce:
 
     version = 0
     held = missing = Intervals.empty()
-    is_complete, waits = True, False
+    is_complete, waits, is_little = True, False, False
 
     def __init__(self) -> None:
         self._due: list[bytes] = []

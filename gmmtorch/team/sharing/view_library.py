@@ -18,8 +18,8 @@ from gmmtorch.team.sharing.messages.mission_messages import (
     STAMP_TICKS,
     ViewsMessage,
     encode_views,
-    quantized_poses,
     quantized_value,
+    quantized_views,
 )
 from gmmtorch.team.sharing.replica.record_keys import (
     LARGEST_INCARNATION,
@@ -38,7 +38,7 @@ MOST_OWN_VIEWS = 256
 """Views of one robot; the least valuable are removed."""
 TIME_TO_LIVE = 1800.0
 """Seconds without a new value after which a view is removed: the length of a mission, for distant views."""
-REPEAT_AFTER, STAGGER = 60.0, 8.0
+REPEAT_AFTER, STAGGER = 120.0, 8.0
 """Seconds of silence about a view until its finder repeats it; and the further wait of each next robot."""
 MOST_REPEATED = 4
 """Views that are repeated in one call."""
@@ -74,7 +74,7 @@ class ViewLibrary:
     """Views by key, as of records (see `record_keys`), and the keys of removed views, which never come back.
 
     The library is best-effort: a stale or missing view costs a detour, but never changes the map. Changes
-    made here are sent once, in the next `datagrams`. After a minute without messages of a view, its finder
+    made here are sent once, in the next `datagrams`. After two minutes without messages of a view, its finder
     sends it again, or another robot if the finder is gone: for losses, and for robots that join late. If a
     robot sends a view that was removed here, the removal is sent again. Views are stored as messages carry
     them (`encode_views`), so that without losses all libraries are equal.
@@ -130,7 +130,7 @@ class ViewLibrary:
     def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[int]:
         """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their keys."""
         added: list[int] = []
-        rows, worth = quantized_poses(poses).numpy(), values.detach().cpu().double().numpy()
+        rows, worth = quantized_views(poses).numpy(), values.detach().cpu().double().numpy()
         order = np.argsort(-worth, kind="stable")
         order = order[worth[order] >= max(least, 1e-6)]
         near = self.candidates().poses.numpy()

@@ -115,7 +115,7 @@ class FrameRule:
     update_novel: bool = False
     update_stride: int | None = 11
     update_at: float = 3.0
-    update_every: int = 30
+    update_every: int = 60
 
     def __post_init__(self) -> None:
         for name in ("side", "noise", "length", "cell"):

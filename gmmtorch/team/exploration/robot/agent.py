@@ -248,7 +248,8 @@ class Agent:
         self.heard_at: dict[int, float] = {}
         self._places: dict[int, tuple[float, Tensor]] = {}  # where teammates were, (N, 3), and when
         self._newest: dict[int, int] = {}  # sequence of the newest component of each teammate
-        self._told_at, self._has_new = -math.inf, False  # when it said where it is; whether components do
+        self._told_at = -math.inf  # when it was where it last said that it is
+        self._sensed_at = self._learned_at = -math.inf  # its last frame, and the last with components
         self.refused: Counter[str] = Counter()
         self._evaluator, self._primitives = evaluator, primitives
         self._waiting = Waiting(primitives, _PATIENCE)
@@ -259,7 +260,8 @@ class Agent:
         self._rests = False
         self._seen_from: tuple[Tensor, tuple[Tensor, Tensor]] | None = None  # the last pose, and its beams
         self._plan: Plan | None = None
-        self._views_at = self._map_at = -math.inf  # when views, and records of the map, were sent last
+        self._views_at = self._map_at = -math.inf  # when views were sent last, and records asked for
+        self._held_at = -math.inf  # since when few records wait for more
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
         self._n_unsent = 0  # plans at that pose since
 
@@ -295,7 +297,7 @@ class Agent:
         """Learns from a frame, and sends what is due of the map."""
         with self.watch("mapping"):
             update = self.robot.sense(frame)
-        self._has_new |= bool(update.evidence)
+        self._sensed_at, self._learned_at = now, now if update.evidence else self._learned_at
         with self.watch("sharing"):
             self.send_map(now)
         return update
@@ -304,19 +306,25 @@ class Agent:
 
     def send_map(self, now: float) -> None:
         """Sends what is due of the map, and announcements if they are due; less than a datagram once
-        in a planning period only, so that components of several frames share it."""
-        shared = self.robot.mapper.shared
-        sends_at = self._map_at + self.options.dynamics.duration - 1e-9
-        is_early = self._map_at <= now < sends_at  # if not, the clock was perhaps set back
+        in a planning period only, so that components of several frames share it. While it flies, few
+        records wait longer: they tell teammates little, and a datagram of their own takes many bytes."""
+        shared, period = self.robot.mapper.shared, self.options.dynamics.duration
+        is_early = self._map_at <= now < self._map_at + period - 1e-9  # or the clock was set back
         if not self.options.shares or (is_early and shared.waits):
             return
         self._map_at = now
-        datagrams = self.radio.within_budget(lambda budget: shared.datagrams(budget=budget), now)
+        flies = self._sensed_at <= now < self._sensed_at + period
+        is_held = self._held_at <= now < self._held_at + self._longest_hold - 1e-9
+        if is_held and flies and shared.is_little:
+            datagrams = shared.datagrams(budget=0)  # so that records in flight arrive
+        else:
+            datagrams = self.radio.within_budget(lambda budget: shared.datagrams(budget=budget), now)
+            self._held_at = now
+        if datagrams:
+            self._told_at = max(self._told_at, self._learned_at)
         if self.radio.announcements.due(now, (shared.version,), bool(shared.missing), shared.is_complete):
             datagrams += shared.announcements()
         self.radio.send(datagrams, now)
-        if datagrams and self._has_new:
-            self._told_at, self._has_new = max(self._told_at, self._seen_at(now)), False
 
     def send_views(self, now: float) -> None:
         """Sends views every `_VIEWS_EVERY` seconds, if the map leaves enough of the budget."""
@@ -371,11 +379,12 @@ class Agent:
         if is_teammate and sequence > self._newest.get(sender, -1):
             self._newest[sender] = sequence
             origins = components.origins[components.seen_from[components.seen_by == newest]]
-            self._places[sender] = self._seen_at(now), origins.double()
+            self._places[sender] = now - self._longest_hold, origins.double()
 
-    def _seen_at(self, now: float) -> float:
-        """When the newest of the components that are sent now was seen, at the earliest."""
-        return now - self.options.dynamics.duration
+    @property
+    def _longest_hold(self) -> float:
+        """Seconds for which components wait until they are sent, at most."""
+        return max(self.options.dynamics.duration, self.options.announce_every)
 
     # -- planning ---------------------------------------------------------------------------------
 

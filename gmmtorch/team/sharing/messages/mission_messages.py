@@ -113,12 +113,12 @@ STEPS_PER_METRE = 100
 YAW_STEPS = 256
 """Steps of a full turn."""
 VIEW_YAW_STEPS = 32
-"""Those of the views of a plan, whose positions are whole decimetres, because their information is that of
-the nearest pose of a coarser lattice."""
+"""Those of views, whose positions are whole decimetres, because their information is that of the nearest pose
+of a coarser lattice, and a robot that comes near has visited them."""
 _YAW_BITS = 8
 _COARSER = np.array([10] * 3 + [YAW_STEPS // VIEW_YAW_STEPS])
-TICKS, STAMP_TICKS = 1000, 10
-"""Times of plans are whole milliseconds; stamps of views are whole tenths of a second."""
+TICKS, STAMP_TICKS = 1000, 1
+"""Times of plans are whole milliseconds; stamps of views are whole seconds."""
 LATEST = 1e9
 """Latest time (s)."""
 _FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
@@ -158,10 +158,10 @@ class PlanMessage:
 
 
 def encode_views(message: ViewsMessage) -> list[bytes]:
-    """Datagrams of views, 7 to 9 bytes each, and of removed keys; empty without either. Ids in any order.
+    """Datagrams of views, 5 to 7 bytes each, and of removed keys; empty without either. Ids in any order.
 
-    Poses are rounded to 1 cm and 1/256 of a turn (`quantized_poses`), values to four significant bits
-    (`quantized_values`), stamps to 0.1 s. Raises `InvalidArgumentError` for values that are not finite, for
+    Poses are rounded to 10 cm and 1/32 of a turn (`quantized_views`), values to four significant bits
+    (`quantized_values`), stamps to 1 s. Raises `InvalidArgumentError` for values that are not finite, for
     duplicate ids, and for rows of different lengths.
     """
     m = message
@@ -179,7 +179,7 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
         raise InvalidArgumentError(f"ids: {error}") from error
     order, removed = np.argsort(keys), m.removed
     keys = keys[order]
-    steps = _pose_steps("poses", m.poses)[order]
+    steps = _coarse(_pose_steps("poses", m.poses))[order]
     values = _value_steps(m.values.detach().double().cpu().numpy())[order]
     times = _ticks("stamps", m.stamps, STAMP_TICKS)[order]
 
@@ -189,7 +189,7 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
         edges = slice(2 * max(begin - len(keys), 0), 2 * max(end - len(keys), 0))
         writer = BitWriter()
         write_keys(writer, keys[views])
-        _write_poses(writer, steps[views])
+        _write_views(writer, steps[views])
         writer.column(values[views])
         writer.column(times[views])
         write_intervals(writer, Intervals(removed.edges[edges]), 0)
@@ -201,7 +201,7 @@ def encode_views(message: ViewsMessage) -> list[bytes]:
 def read_views(body: bytes) -> ViewsMessage:
     reader = BitReader(body)
     keys = read_keys(reader)
-    poses = _read_poses(reader, len(keys))
+    poses = _read_views(reader, len(keys))
     values = reader.column(len(keys))
     if len(values) and int(np.abs(values).max()) > _LARGEST_VALUE >> _VALUE_SHIFT:
         raise DataError("Values are NaN or infinite: it is damaged.")
@@ -310,17 +310,17 @@ def _values(steps: Ints) -> NDArray[np.float64]:
 
 
 def quantized_poses(poses: Tensor) -> Tensor:
-    """Poses (N, 4) as messages round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
+    """Poses (N, 4) of a path as plans round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
     return _poses(_pose_steps("poses", poses))
 
 
 def quantized_views(poses: Tensor) -> Tensor:
-    """Views (N, 4) as plans round them: to 10 cm and 1/32 of a turn, yaw in [−π, π)."""
+    """Views (N, 4) as messages round them: to 10 cm and 1/32 of a turn, yaw in [−π, π)."""
     return _poses(_coarse(_pose_steps("views", poses)) * _COARSER)
 
 
 def _coarse(steps: Ints) -> Ints:
-    """Poses (N, 4) in the steps of the views of a plan."""
+    """Poses (N, 4) in the steps of views."""
     rounded: Ints = np.rint(steps / _COARSER).astype(np.int64)
     rounded[:, 3] %= VIEW_YAW_STEPS
     return rounded
@@ -344,18 +344,19 @@ def _pose_steps(name: str, poses: Tensor) -> Ints:
     return steps
 
 
-def _write_poses(writer: BitWriter, steps: Ints) -> None:
-    """Write unrelated poses (N, 4) as four columns."""
+def _write_views(writer: BitWriter, steps: Ints) -> None:
+    """Write unrelated views (N, 4), in steps of views, as four columns."""
     for axis in range(4 if len(steps) else 0):
         writer.column(steps[:, axis])
 
 
-def _read_poses(reader: BitReader, n: int) -> Tensor:
-    """Poses (n, 4). Columns may take no bits at all, so the caller must bound n."""
+def _read_views(reader: BitReader, n: int) -> Tensor:
+    """Views (n, 4). Columns may take no bits at all, so the caller must bound n."""
     steps = np.zeros((n, 4), np.int64)
     for axis in range(4 if n else 0):
         steps[:, axis] = reader.column(n)
-    return _checked_poses(steps)
+    farthest = int(_FARTHEST_STEP)
+    return _checked_poses(steps.clip(-farthest, farthest) * _COARSER)  # which does not overflow
 
 
 def _write_path(writer: BitWriter, steps: Ints) -> Ints:

@@ -52,6 +52,7 @@ class Backlog:
         own = keys_of_robot(robot)
         self._own = Intervals.union([own.shifted(CHANNELS), own])
         self.due = Intervals.empty()
+        self.is_asked = False  # whether some of `due` were lost
         self._in_flight = [Intervals.empty()] * _CALLS_IN_FLIGHT  # since the last call of `sent`, and before
         self._gaps: OrderedDict[int, Intervals] = OrderedDict()  # what others lack, by robot
         self._theirs: OrderedDict[int, Intervals] = OrderedDict()  # what others hold and this robot lacked
@@ -70,6 +71,7 @@ class Backlog:
     def sent(self, keys: Intervals) -> None:
         """All records that this robot has sent since the last call."""
         self.due -= keys
+        self.is_asked &= not keys
         self._in_flight = [keys.up_to(MOST_IN_FLIGHT), *self._in_flight[:-1]]
 
     def announcing(self) -> None:
@@ -92,6 +94,7 @@ class Backlog:
             lacking |= lacking.shifted(CHANNELS) & held
         for keys in self._in_flight:
             lacking -= keys
+        self.is_asked |= bool(lacking - self.due - dead)
         self.due = (self.due | lacking) - dead
         self._waited.pop(message.sender, None)
         for table, now in ((self._gaps, gap), (self._theirs, message.held - held)):
@@ -109,6 +112,7 @@ class Backlog:
 
 _OF_CHANNELS = Intervals.span(CHANNELS, CHANNELS + END)
 ABOUT_A_DATAGRAM = 160  # components
+FEW = 32  # components, of 4 bytes each, of a datagram that has 20 bytes more, and 28 of UDP and IPv4
 _RUN = 32  # components with consecutive keys whose information is compared
 
 

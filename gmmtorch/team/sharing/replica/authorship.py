@@ -83,7 +83,8 @@ class MovedMap(NamedTuple):
 _MOST_SUPERSESSIONS = 32  # effective supersessions of this author before they are merged
 _MOST_OUTDATED = 64
 """Outdated entries in records of counters, beyond as many as are current, before all are rewritten."""
-_MOST_SHORT = 16  # records of counters shorter than half of `RECORD_BYTES` before they are merged
+_MOST_SHORT = 16  # records of counters shorter than `_SHORT` before they are merged
+_SHORT = 64  # bytes, of which a third says whose counters follow
 _MOST_POINTS = 2.0**40
 _MORE_PREDICTIONS = 1.5  # growth of the number of predictions after which a calibration is written again
 
@@ -214,7 +215,7 @@ class Author:
         """Rewrite all counters if most entries are outdated; else the short records if there are many."""
         own = list(self._records.counters.of(author_of(self._first)).values())
         if sum(len(record.components) for record in own) <= 2 * len(self._written_steps) + _MOST_OUTDATED:
-            own = [r for r in own if len(self._records.datagrams[r.key]) < RECORD_BYTES // 2]
+            own = [r for r in own if len(self._records.datagrams[r.key]) < _SHORT]
             if len(own) <= _MOST_SHORT:
                 return Intervals.empty()
         keys = np.unique(np.concatenate([record.components for record in own]))

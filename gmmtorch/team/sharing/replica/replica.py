@@ -30,7 +30,7 @@ from gmmtorch.team.sharing.messages.record_messages import (
     check_size,
     encode_announcements,
 )
-from gmmtorch.team.sharing.replica.anti_entropy import ABOUT_A_DATAGRAM, Backlog, packets
+from gmmtorch.team.sharing.replica.anti_entropy import ABOUT_A_DATAGRAM, FEW, Backlog, packets
 from gmmtorch.team.sharing.replica.authorship import Author, MovedMap, Published
 from gmmtorch.team.sharing.replica.materialized_view import Changes, Placement, robot_of_frame
 from gmmtorch.team.sharing.replica.record_keys import (
@@ -384,6 +384,12 @@ class Replica:
     def waits(self) -> bool:
         """Whether what is due fills less than a datagram, so that it takes fewer bytes together with more."""
         return self._backlog.due.size < ABOUT_A_DATAGRAM
+
+    @property
+    def is_little(self) -> bool:
+        """Whether what is due is so little that a datagram of it would take a quarter of its bytes for what
+        the records of a datagram share; and nobody waits for it."""
+        return 0 < self._backlog.due.size < FEW and not self._backlog.is_asked
 
     @property
     def version(self) -> int:
