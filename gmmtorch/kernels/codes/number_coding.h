@@ -39,7 +39,7 @@ struct NumberWalk {
         for (int64_t a = 0; a < b.width && c.good; ++a) {
             int64_t expected = a > 0 ? size[a - 1] : 0;
             if (begun) {
-                const int64_t shift = a > 0 ? (64 * size[a - 1] - b.level[a - 1]) >> 1 : 0;
+                const int64_t shift = a > 0 ? 64 * size[a - 1] - b.level[a - 1] : 0;
                 expected = (b.level[a] + shift + 32) >> 6;
             }
             code(size[a], 1 + minimum(a, (int64_t)2), expected, b.most);

@@ -67,6 +67,6 @@ x5_lLVtu$es)hegya@lYc+<cCe+Kp+3@h8NVO;e(E;?w!+u3#D>R~e$nkIaI2^pPGELObo=U;$+Qrd!l
 }I#|El^ZyO8!mb4
 """
 OF_ATTRIBUTES = """
-c-ouJ$iTqJ$oQWD4*sLiQRNH_s~;@=3zI!}`4X63%&-hhH#adb9QyDZuKPBWxe3besbgR`{S#sOJqA>u1(bJ5u9~%W%PlZ}>bx~O4qOGA+dg&
-jq`DaliuDW(R%Kg`UAY5MKYitiOItwdTIbE#S|7-85U79OtAB9w&OL+BP~{AZ%NQ7*Ald&4&HkCy3=Gc@+8N%U$#-@F-TVi^e~u;(0Ib(P$^
+c-ouJ$iTqJ$oQWD4*sLiNfitXn;y>i3zI!@xgSg)W{^LItQr>}ByU{Hzz~?+FmL0rCt&{U`D?c9JkG$-(X_aEPVFoPn|cO@oK2_horJ1iz5Dt
+_5It+&)OjHK5Kw>Lk!NuCt=@kPOs`!36ilzLV_>*>|2N#e-LD~ZIh4Nx=)c?dUc%)!K8MhIp#04Z3=CHv!;NRS{s=<XK=}aW;XgS
 """

@@ -96,7 +96,7 @@ def _walk(coder: RangeCoder, rows: list[list[int]], width: int) -> None:
         for a in range(width):
             expected = size[a - 1] if a else 0
             if level:
-                shift = (_LEVEL * size[a - 1] - level[a - 1]) // 2 if a else 0
+                shift = _LEVEL * size[a - 1] - level[a - 1] if a else 0
                 expected = (level[a] + shift + _LEVEL // 2) // _LEVEL
             size[a] = coded(row, 1 + a, _FIELDS[1 + min(a, 2)], expected, LARGEST_POWER)
             step[a] = power[size[a] + LARGEST_POWER]
