@@ -1,8 +1,8 @@
 """Attributes of components as bytes, a block beside the batch of their geometry; see docs/formats.md.
 
 Errors are measured in a component's own deviations, as in `lattice`. Of a channel of numbers: a step, a power
-of √2, which is the deviation from its plane divided by √2; the mean, and the slopes along the component's
-axes, in these steps, so that each has the same share in the error of a prediction. Colours are written as
+of √2, which is half the deviation from its plane; the mean, and the slopes along the component's axes, in
+these steps, so that each has the same share in the error of a prediction. Colours are written as
 lightness and two differences, whose deviations are independent, with one step for all three, because an error
 of each counts alike. Of a channel of classes: the most likely label, the next one, and their shares in
 eighths. Every component is rounded by itself, and rounding again changes nothing.
@@ -194,11 +194,11 @@ def _number_steps(name: str, channel: Numbers, covariances: Tensor) -> Tensor:
     variance = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2)
     if name == COLOUR:
         variance = variance.mean(1, keepdim=True).expand_as(variance)
-    size, mean = _log(variance / 2), given
+    size, mean = _log(variance / 4), given
     # More than once, as the least step follows the rounded mean: so rounding again changes nothing.
     for _ in range(1 if name == COLOUR else 3):
         least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
-        least = _log(least.square() / 2)
+        least = _log(least.square() / 4)
         size = torch.where(size < least - 2, least, size).clamp_min(-LARGEST_POWER)
         mean = (given / _power(size)).round() * _power(size)
     if bool((size > LARGEST_POWER).any()):
@@ -251,7 +251,7 @@ def _numbers_of(name: str, steps: Tensor, covariances: Tensor) -> Numbers:
     along = slope.reshape(len(rows), width, dim) * step[:, :, None]
     basis = _basis(name, step)
     own_slope = basis.T @ torch.linalg.solve(_factors(covariances[rows]), along, left=False)
-    own = (mean * step) @ basis, own_slope, basis.T @ torch.diag_embed(2 * step.square()) @ basis
+    own = (mean * step) @ basis, own_slope, basis.T @ torch.diag_embed(4 * step.square()) @ basis
     share = steps[:, 0].double() / WHOLE
     found = Numbers(share, *(share.new_zeros(k, *values.shape[1:]) for values in own))
     for whole, values in zip(found[1:], own, strict=True):

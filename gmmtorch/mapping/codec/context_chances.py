@@ -67,6 +67,6 @@ x5_lLVtu$es)hegya@lYc+<cCe+Kp+3@h8NVO;e(E;?w!+u3#D>R~e$nkIaI2^pPGELObo=U;$+Qrd!l
 }I#|El^ZyO8!mb4
 """
 OF_ATTRIBUTES = """
-c-ouJ$iTqJ$oQWD4*sLiNfitXn;y>i3zI!@xgSg)W{^LItQr>}ByU{Hzz~?+FmL0rCt&{U`D?c9JkG$-(X_aEPVFoPn|cO@oK2_horJ1iz5Dt
-_5It+&)OjHK5Kw>Lk!NuCt=@kPOs`!36ilzLV_>*>|2N#e-LD~ZIh4Nx=)c?dUc%)!K8MhIp#04Z3=CHv!;NRS{s=<XK=}aW;XgS
+c-ouJ$iTqJ$oQWD4*sLiNfitXo1V45g~=X2q6((>FfbfIR*ee~lGmtXU~r7goV;@T4KRP&w598}A7x-@Y3o_g-PggO1C$S+c;NDRsQOu(cV7b
+0i>I#ZJ_)2Z0OjizT>1htZ_dG+V0!+l1J}X)dZ3#xeuLY079!2C38uc1f#Jl3XK?wW2O#ueD1UAv1H<<FaPKpmJ_ez;CO~KayZt^x
 """
