@@ -51,8 +51,9 @@ struct NumberWalk {
             code(mean[a], a > 0 ? 5 : 4, expected, 1ll << 40);
         }
         int64_t steep = 0;
-        for (int64_t i = 0; i < b.n - 1 - 2 * b.width && c.good; ++i) {
-            code(slope[i], 6 + minimum(steep, (int64_t)3), 0, 1ll << 40);
+        const int64_t n_slopes = b.n - 1 - 2 * b.width, later = n_slopes / b.width;
+        for (int64_t i = 0; i < n_slopes && c.good; ++i) {
+            code(slope[i], (i < later ? 6 : 10) + minimum(steep, (int64_t)3), 0, 1ll << 40);
             steep += slope[i] < 0 ? -slope[i] : slope[i];
         }
         if (!c.good) return;

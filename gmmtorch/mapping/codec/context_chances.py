@@ -68,5 +68,6 @@ x5_lLVtu$es)hegya@lYc+<cCe+Kp+3@h8NVO;e(E;?w!+u3#D>R~e$nkIaI2^pPGELObo=U;$+Qrd!l
 """
 OF_ATTRIBUTES = """
 c-ouJ$iTqJ$oQWD4*sLiNfitXo1V45g~=X2q6((>FfbfIR*ee~lGmtXU~r7goV;@T4KRP&w598}A7x-@Y3o_g-PggO1C$S+c;NDRsQOu(cV7b
-0i>I#ZJ_)2Z0OjizT>1htZ_dG+V0!+l1J}X)dZ3#xeuLY079!2C38uc1f#Jl3XK?wW2O#ueD1UAv1H<<FaPKpmJ_ez;CO~KayZt^x
+0i>I#ZJ_)4P)H5*D%)j&nX5O5GH^KD$RR^wv=o!@v3_Fj0gWGoiBF(S~%I^jGZ^P!NaQU74AoM{fza41)^dpbq@+-GN=>B*J{j8FK;WZxr&1+
+|1xc?8q|AZ#LxQc<{=5GZ55}N#iCSaJqLl|)D9)x}Y<pTir{!Mr
 """

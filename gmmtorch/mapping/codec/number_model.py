@@ -25,7 +25,8 @@ LARGEST_POWER = 80
 """Largest power of √2 of a step, and of its inverse."""
 WHOLE = 8
 """Parts of a share."""
-_FIELDS = ("SHARE", "FIRST", "SECOND", "LATER", "MEAN", "OTHER", "FLAT", "TILTED", "STEEP", "STEEPER")
+_SLOPES = ("FLAT", "TILTED", "STEEP", "STEEPER")  # of the first column, and of later ones
+_FIELDS = ("SHARE", "FIRST", "SECOND", "LATER", "MEAN", "OTHER", *_SLOPES, *(f"LATER_{s}" for s in _SLOPES))
 _FOLLOWS = 0.6  # how far the expected mean moves to that of the last component
 _LEVEL = 64  # parts of a power, in their running mean
 _BYTES, _WIDEST = 16, 128  # of a number, usually and at most
@@ -104,9 +105,10 @@ def _walk(coder: RangeCoder, rows: list[list[int]], width: int) -> None:
             near = math.floor(height[a] / step[a] + 0.5) if height else 0
             expected = near if abs(near) < MOST_STEPS else 0
             coded(row, 1 + width + a, "OTHER" if a else "MEAN", expected, MOST_STEPS)
-        steep = 0
-        for place in range(1 + 2 * width, len(row)):
-            steep += abs(coded(row, place, _FIELDS[6 + min(steep, 3)], 0, MOST_STEPS))
+        steep, begin = 0, 1 + 2 * width
+        for place in range(begin, len(row)):
+            first = 6 if (place - begin) * width < len(row) - begin else 10
+            steep += abs(coded(row, place, _FIELDS[first + min(steep, 3)], 0, MOST_STEPS))
         value = [row[1 + width + a] * step[a] for a in range(width)]
         if level:
             height = [h + _FOLLOWS * (v - h) for h, v in zip(height, value, strict=True)]
