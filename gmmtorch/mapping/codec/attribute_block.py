@@ -191,8 +191,8 @@ def _number_steps(name: str, channel: Numbers, covariances: Tensor) -> Tensor:
     rows = share > 0
     basis = _basis(name, channel.mean)
     given = channel.mean[rows] @ basis.T
-    variance = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2)
-    if name == COLOUR:
+    variance = channel.covariance[rows].diagonal(dim1=1, dim2=2)
+    if name == COLOUR:  # the same in every basis
         variance = variance.mean(1, keepdim=True).expand_as(variance)
     size, mean = _log(variance / 4), given
     # More than once, as the least step follows the rounded mean: so rounding again changes nothing.
@@ -206,7 +206,7 @@ def _number_steps(name: str, channel: Numbers, covariances: Tensor) -> Tensor:
             f"attributes {name!r} reach {float(given.abs().max()):g}, too large to be stored."
         )
     step = _power(size)
-    along = (basis @ channel.slope[rows]) @ _factors(covariances[rows])
+    along = ((channel.slope[rows] @ _factors(covariances[rows])).mT @ basis.T).mT
     values = torch.cat([given / step, (along / step[:, :, None]).flatten(1)], 1)
     return _spread(share, torch.cat([size, values.round().clamp(-MOST_STEPS, MOST_STEPS).long()], 1))
 
