@@ -29,7 +29,7 @@ SHOWN: dict[str, dict[str, tuple[str, ...]]] = {
             "registration of two scans of hall",
         )
     },
-    "attributes": {"result": ("19.85 dB", "20.05 dB", "20.27 dB", "20.64 dB")},
+    "attributes": {"result": ("20.28 dB", "20.27 dB", "20.47 dB", "20.64 dB")},
     "calibration-peers": {"cell (m)": ("0.2",)},
     "changing-world": {
         "map": (

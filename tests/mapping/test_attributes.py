@@ -23,7 +23,12 @@ from gmmtorch.mapping import Attributes, BitWriter, Labels, Numbers, TiledMap, q
 from gmmtorch.mapping.attributes import moments
 from gmmtorch.mapping.attributes.answers import predictions
 from gmmtorch.mapping.codec import number_model
-from gmmtorch.mapping.codec.attribute_block import decode_attributes, encode_attributes
+from gmmtorch.mapping.codec.attribute_block import (
+    BLOCK_VERSION,
+    _factors,
+    decode_attributes,
+    encode_attributes,
+)
 from gmmtorch.mapping.learning.merging import compact
 from gmmtorch.mixture import Cells, merge_components
 from gmmtorch.mixture.em.exact import quadratic_features
@@ -227,7 +232,12 @@ def test_predictions_are_those_of_the_joint_mixture():
     points = c.means + 0.05 * normal(5, 3, seed=9)
     found = predictions(c, points, cutoff=40.0)["heat"]
     means, covariances = joint(c)
-    share = c.attributes.channels["heat"].share
+    known = (c.support * c.attributes.channels["heat"].share)[:, None]
+    usual = (known * means[:, 3:]).sum(0) / known.sum()
+    around = covariances[:, 3:, 3:].diagonal(dim1=1, dim2=2) + (means[:, 3:] - usual) ** 2
+    gradients = covariances[:, 3:, :3] @ torch.linalg.inv(covariances[:, :3, :3])
+    around = around - (gradients @ covariances[:, :3, 3:]).diagonal(dim1=1, dim2=2)
+    least = 0.01 * (known * around).sum(0) / known.sum()  # a tenth of the deviation in the map
     for row, point in enumerate(points):
         weight, mean, square = [], [], []
         for k in range(5):
@@ -238,13 +248,14 @@ def test_predictions_are_those_of_the_joint_mixture():
             offset = offset * min(1, 2.5 / far)  # slopes are followed up to 2.5 deviations
             value = means[k, 3:] + gain @ offset
             density = multivariate_normal(means[k, :3].numpy(), own[:3, :3].numpy()).pdf(point.numpy())
-            weight.append(float(c.support[k] * share[k]) * density)
+            noise = (own[3:, 3:] - gain @ own[:3, 3:]).diagonal()
+            weight.append(known[k] * density / (noise + least).sqrt())
             mean.append(value)
-            square.append((own[3:, 3:] - gain @ own[:3, 3:]).diagonal() + value**2)
-        shares = torch.tensor(weight).double() / sum(weight)
-        wanted = (shares[:, None] * torch.stack(mean)).sum(0)
+            square.append(noise + value**2)
+        shares = torch.stack(weight) / torch.stack(weight).sum(0)
+        wanted = (shares * torch.stack(mean)).sum(0)
         torch.testing.assert_close(found.mean[row], wanted, rtol=1e-8, atol=1e-10)
-        variance = (shares[:, None] * torch.stack(square)).sum(0) - wanted**2
+        variance = (shares * torch.stack(square)).sum(0) - wanted**2
         torch.testing.assert_close(found.variance[row], variance, rtol=1e-7, atol=1e-9)
 
 
@@ -304,7 +315,10 @@ def test_rounding_is_bounded_in_deviations():
     own, found = c.attributes.channels["heat"], once.attributes.channels["heat"]
     noise = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
     moved = own.mean + (own.slope @ (once.means - c.means)[:, :, None])[:, :, 0]
-    assert bool(((moved - found.mean).abs() <= 0.25 * noise * (1 + 1e-9)).all())
+    half = noise * 0.25 * (1 + 1e-9)  # of a step, which is σ/2
+    assert bool(((moved - found.mean).abs() <= half).all())
+    along = (own.slope - found.slope) @ _factors(once.covariances)  # over a deviation of each axis
+    assert bool((along.abs() <= half[:, :, None]).all())
     ratio = noise / own.covariance.diagonal(dim1=1, dim2=2).sqrt()
     assert float(ratio.min()) > 2**-0.26
     assert float(ratio.max()) < 2**0.26
@@ -359,7 +373,7 @@ def test_many_components_with_many_labels_are_refused_before_memory_is_taken():
         writer.column(column)
     eye = torch.eye(3, dtype=torch.float64).expand(100_000, 3, 3)
     with pytest.raises(DataError, match="too many to read"):
-        decode_attributes(b"\1" + writer.to_bytes(), eye)
+        decode_attributes(bytes([BLOCK_VERSION]) + writer.to_bytes(), eye)
 
 
 def test_a_budget_holds_with_attributes(tmp_path):

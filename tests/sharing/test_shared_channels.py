@@ -19,6 +19,7 @@ import gmmtorch as gt
 from gmmtorch import Components
 from gmmtorch.errors import DataError
 from gmmtorch.mapping import Attributes, BitWriter, Labels, Numbers, encode, has_channels, quantized
+from gmmtorch.mapping.codec.attribute_block import BLOCK_VERSION
 from gmmtorch.mapping.codec.component_batch import decode as decode_batch
 from gmmtorch.team.sharing import Broadcast, Replica, Store, decode
 from gmmtorch.team.sharing.messages.component_messages import ComponentsMessage, encode_components
@@ -260,7 +261,7 @@ def test_a_block_with_more_values_than_a_message_may_have_is_refused():
     block.one(ord("x"), 8)
     for number in (0, 65536):
         block.number(number)
-    body = b"\x03" + size.to_bytes() + batch[:-4] + b"\x01" + block.to_bytes()
+    body = b"\x03" + size.to_bytes() + batch[:-4] + bytes([BLOCK_VERSION]) + block.to_bytes()
     with pytest.raises(DataError, match="too many"):
         decode_batch(sealed(body), 1024)
 

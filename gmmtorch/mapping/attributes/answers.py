@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
-from gmmtorch.mapping.attributes.moments import Channel, Labels, overall
+from gmmtorch.mapping.attributes.moments import FINE, Channel, Labels, overall
 from gmmtorch.mapping.attributes.reflectivity import gain
 from gmmtorch.mapping.components import Components
 from gmmtorch.mapping.learning.novelty import box_around, portions
@@ -59,9 +59,10 @@ def predictions(
     """Each channel of the components at points (M, D), float64, on their device. Differentiable.
 
     The surface components within `cutoff` deviations of a point predict it, weighted by
-    support · share · N(x; μ, Σ); the variance is that of the mixture of their predictions. Memory does not
-    grow with the number of pairs of points and components. seen: the law of intensities, and the positions
-    (M, D) of the sensors that measure them; None: reflectivities as they are.
+    support · share · N(x; μ, Σ), and a number also by 1/σ, the height of its density, so that of components
+    that overlap those with the clearest value count most. The variance is that of the mixture of their
+    predictions. Memory does not grow with the number of pairs of points and components. seen: the law of
+    intensities, and the positions (M, D) of the sensors that measure them; None: reflectivities as they are.
     """
     if not components.attributes:
         return {}
@@ -72,6 +73,8 @@ def predictions(
     height = solid.support.double().log() - log_norm
     channels, order = solid.attributes.channels, []
     found: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {name: [] for name in channels}
+    usual = {name: overall(channel, solid.support) for name, channel in channels.items()}
+    least = {name: FINE**2 * variance for name, (_, variance) in usual.items()}
     boxes = box_around(solid, cutoff**2)
     for part, some in portions(asked.detach(), max(1, len(solid)), boxes) if len(asked) else ():
         offset = asked[part, None] - solid.means[some]
@@ -88,45 +91,46 @@ def predictions(
             if seen is not None and name == INTENSITY:
                 rays = (asked - seen[1][inside])[part, None].expand_as(offset)
                 factor = gain(seen[0], rays, white[some])
-            found[name].append(_mixed(channel, some, weight, offset, factor))
+            found[name].append(_mixed(channel, some, weight, offset, factor, least[name]))
     rows = inside[torch.cat(order)] if order else inside
     return {
-        name: _placed(name, channel, solid.support, found[name], rows, points)
+        name: _placed(name, channel, usual[name], found[name], rows, points)
         for name, channel in channels.items()
     }
 
 
 def _mixed(
-    channel: Channel, some: Tensor, weight: Tensor, offset: Tensor, factor: Tensor | None
+    channel: Channel, some: Tensor, weight: Tensor, offset: Tensor, factor: Tensor | None, least: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean and variance (n, A) of the mixture of the predictions of some components, times `factor` (n, J),
-    and their total weight (n,), for weight (n, J) and offset (n, J, D) from their means."""
+    and their total weight (n,), for weight (n, J) and offset (n, J, D) from their means. least: variance (A,)
+    that is added in weights."""
     if isinstance(channel, Labels):
         total = weight @ channel.share[some].sum(1)
         mean = (weight @ channel.share[some]) / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]
         return mean, mean * (1 - mean), total
     weight = weight * channel.share[some]
     total = weight.sum(1)
-    share = weight / total.clamp_min(torch.finfo(total.dtype).tiny)[:, None]
-    own = channel.mean[some] + torch.einsum("kad,nkd->nka", channel.slope[some], offset)
     noise = channel.covariance[some].diagonal(dim1=1, dim2=2)
-    own, scaled = (own, share) if factor is None else (own * factor[..., None], share * factor.square())
-    mean = torch.einsum("nk,nka->na", share, own)
-    spread = torch.einsum("nk,nka->na", share, (own - mean[:, None]).square())
-    return mean, spread + scaled @ noise, total
+    weight = weight[..., None] / (noise + least).sqrt()
+    share = weight / weight.sum(1, keepdim=True).clamp_min(torch.finfo(total.dtype).tiny)
+    own = channel.mean[some] + torch.einsum("kad,nkd->nka", channel.slope[some], offset)
+    if factor is not None:
+        own, noise = own * factor[..., None], noise * factor.square()[..., None]
+    mean = (share * own).sum(1)
+    return mean, (share * ((own - mean[:, None]).square() + noise)).sum(1), total
 
 
 def _placed(
     name: str,
     channel: Channel,
-    support: Tensor,
+    usual: tuple[Tensor, Tensor],
     parts: list[tuple[Tensor, Tensor, Tensor]],
     rows: Tensor,
     points: Tensor,
 ) -> Prediction:
     """The prediction for all points from that for some rows of them, in portions."""
-    mean, variance = overall(channel, support)
-    mean, variance = (value.expand(len(points), -1).clone() for value in (mean, variance))
+    mean, variance = (value.expand(len(points), -1).clone() for value in usual)
     known = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if parts:
         own_mean, own_variance, total = (torch.cat(values) for values in zip(*parts, strict=True))

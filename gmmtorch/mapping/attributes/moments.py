@@ -390,7 +390,8 @@ def _joint(c: Numbers, means: Tensor, covariances: Tensor) -> tuple[Tensor, Tens
     return torch.cat([means, c.mean], 1), torch.cat([upper, lower], 1)
 
 
-_FINE = 0.1  # of a channel's deviation in the map: smaller differences hardly hinder a merge
+FINE = 0.1
+"""Of a channel's deviation in the map: smaller differences hardly hinder a merge or tell answers apart."""
 _SMALL = 1e-3  # of a metre for a deviation: partners of a merge are neighbours in space
 
 
@@ -414,7 +415,7 @@ def joint_moments(
         slope = torch.where(has[..., None], c.slope * scale[:, None], 0.0)
         noise = c.covariance * scale[:, None] * scale
         unknown = torch.diag(torch.full_like(scale, _SMALL**2))
-        noise = torch.where(has[..., None], noise + (_FINE**2) * unknown, unknown)
+        noise = torch.where(has[..., None], noise + FINE**2 * unknown, unknown)
         padded = slope.new_zeros(len(slope), slope.shape[1], means.shape[1])
         padded[:, :, :dim] = slope
         means, covariances = _joint(Numbers(c.share, mean, padded, noise), means, covariances)

@@ -1,10 +1,11 @@
 """Attributes of components as bytes, a block beside the batch of their geometry; see docs/formats.md.
 
-Errors are measured in a component's own deviations, as in `lattice`. Of a channel of numbers: the deviation
-from its plane, a power of √2; the mean and the slopes along the component's axes, except the shortest, as
-multiples of a part of the deviation. Colours are written as lightness and two differences, whose deviations
-are independent. Of a channel of classes: the most likely label, the next one, and their shares in eighths.
-Every component is rounded by itself, and rounding again changes nothing.
+Errors are measured in a component's own deviations, as in `lattice`. Of a channel of numbers: a step, a power
+of √2, which is half the deviation from its plane; the mean, and the slopes along the component's axes, in
+these steps, so that each has the same share in the error of a prediction. Colours are written as
+lightness and two differences, whose deviations are independent, with one step for all three, because an error
+of each counts alike. Of a channel of classes: the most likely label, the next one, and their shares in
+eighths. Every component is rounded by itself, and rounding again changes nothing.
 """
 
 from __future__ import annotations
@@ -18,11 +19,10 @@ from torch import Tensor
 from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError
 from gmmtorch.mapping.attributes.moments import Attributes, Channel, Labels, Numbers
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, within
-from gmmtorch.mapping.codec.number_model import DEVIATIONS, MOST_STEPS, WHOLE, read_rows, write_rows
+from gmmtorch.mapping.codec.number_model import LARGEST_POWER, MOST_STEPS, WHOLE, read_rows, write_rows
 from gmmtorch.scan import COLOUR, LARGEST_LABEL, LONGEST_NAME, MOST_CHANNELS, MOST_COLUMNS
 
-BLOCK_VERSION = 1
-_MEAN_STEPS, _SLOPE_STEPS = 2.0, 1.0  # in a deviation
+BLOCK_VERSION = 2
 _MOST_REST = 3  # eighths of the second label
 _LEAST_COLOUR = 2.0**-8  # deviation
 _LEAST_RELATIVE = 2.0**-36  # deviation of other numbers, relative to the mean
@@ -134,7 +134,7 @@ def decode_attributes(data: bytes, covariances: Tensor, most: int | None = None)
             left -= k * (1 + width * (1 + dim + width))
             _bounded(most - left, "values", 0, most)
         packed = reader.fixed(_bounded(reader.number(), "bytes", 0, reader.left // 8), 8)
-        rows = read_rows(packed.astype(np.uint8).tobytes(), k, 1 + width * (dim + 1), width)
+        rows = read_rows(packed.astype(np.uint8).tobytes(), k, 1 + width * (dim + 2), width)
         found[name] = _numbers_of(name, rows, covariances)
     reader.finish()
     try:
@@ -186,27 +186,29 @@ def _bounded(value: int, name: str, least: int, largest: int) -> int:
 
 
 def _number_steps(name: str, channel: Numbers, covariances: Tensor) -> Tensor:
-    """Rows (K, n) of `number_model`: the share in eighths; deviations and means (A), slopes (A, D−1)."""
+    """Rows (K, n) of `number_model`: the share in eighths; steps and means (A), slopes (A, D)."""
     share = _share_steps(channel.share)
     rows = share > 0
     basis = _basis(name, channel.mean)
     given = channel.mean[rows] @ basis.T
-    noise = (basis @ channel.covariance[rows] @ basis.T).diagonal(dim1=1, dim2=2).clamp_min(1e-30).sqrt()
-    deviation, mean = _log(noise), given
-    # More than once, as the least deviation follows the rounded mean: so rounding again changes nothing.
+    variance = channel.covariance[rows].diagonal(dim1=1, dim2=2)
+    if name == COLOUR:  # the same in every basis
+        variance = variance.mean(1, keepdim=True).expand_as(variance)
+    size, mean = _log(variance / 4), given
+    # More than once, as the least step follows the rounded mean: so rounding again changes nothing.
     for _ in range(1 if name == COLOUR else 3):
         least = torch.full_like(mean, _LEAST_COLOUR) if name == COLOUR else _LEAST_RELATIVE * mean.abs()
-        deviation = torch.where(deviation < _log(least) - 2, _log(least), deviation).clamp_min(-DEVIATIONS)
-        mean = (given / _power(deviation) * _MEAN_STEPS).round() * _power(deviation) / _MEAN_STEPS
-    if bool((deviation > DEVIATIONS).any()):
+        least = _log(least.square() / 4)
+        size = torch.where(size < least - 2, least, size).clamp_min(-LARGEST_POWER)
+        mean = (given / _power(size)).round() * _power(size)
+    if bool((size > LARGEST_POWER).any()):
         raise InvalidArgumentError(
             f"attributes {name!r} reach {float(given.abs().max()):g}, too large to be stored."
         )
-    unit = _power(deviation)
-    along = (basis @ channel.slope[rows]) @ _factors(covariances[rows])[:, :, :-1]
-    steps = (given / unit * _MEAN_STEPS).round(), (along / unit[:, :, None] * _SLOPE_STEPS).round()
-    mean, slope = (values.clamp(-MOST_STEPS, MOST_STEPS).long() for values in steps)
-    return _spread(share, torch.cat([deviation, mean, slope.flatten(1)], 1))
+    step = _power(size)
+    along = ((channel.slope[rows] @ _factors(covariances[rows])).mT @ basis.T).mT
+    values = torch.cat([given / step, (along / step[:, :, None]).flatten(1)], 1)
+    return _spread(share, torch.cat([size, values.round().clamp(-MOST_STEPS, MOST_STEPS).long()], 1))
 
 
 def _share_steps(share: Tensor) -> Tensor:
@@ -214,9 +216,9 @@ def _share_steps(share: Tensor) -> Tensor:
     return torch.where(share > 0, (share * WHOLE).round().long().clamp(1, WHOLE), 0)
 
 
-def _log(noise: Tensor) -> Tensor:
+def _log(variance: Tensor) -> Tensor:
     """Deviations as whole powers of √2."""
-    return (2 * noise.clamp_min(1e-30).log2()).round().long()
+    return variance.clamp_min(1e-60).log2().round().long()
 
 
 def _label_steps(channel: Labels) -> _LabelSteps:
@@ -243,14 +245,13 @@ def _labels_of(steps: _LabelSteps) -> Labels:
 
 def _numbers_of(name: str, steps: Tensor, covariances: Tensor) -> Numbers:
     k, dim = covariances.shape[:2]
-    width, rows = (steps.shape[1] - 1) // (dim + 1), (steps[:, 0] > 0).nonzero().squeeze(1)
-    deviation, mean, slope = steps[rows, 1:].split([width, width, width * (dim - 1)], 1)
-    unit = _power(deviation)
-    along = torch.zeros(len(rows), width, dim, dtype=torch.float64)
-    along[:, :, :-1] = slope.reshape(len(rows), width, dim - 1) * (unit / _SLOPE_STEPS)[:, :, None]
-    basis = _basis(name, unit)
+    width, rows = (steps.shape[1] - 1) // (dim + 2), (steps[:, 0] > 0).nonzero().squeeze(1)
+    size, mean, slope = steps[rows, 1:].split([width, width, width * dim], 1)
+    step = _power(size)
+    along = slope.reshape(len(rows), width, dim) * step[:, :, None]
+    basis = _basis(name, step)
     own_slope = basis.T @ torch.linalg.solve(_factors(covariances[rows]), along, left=False)
-    own = (mean * unit / _MEAN_STEPS) @ basis, own_slope, basis.T @ torch.diag_embed(unit.square()) @ basis
+    own = (mean * step) @ basis, own_slope, basis.T @ torch.diag_embed(4 * step.square()) @ basis
     share = steps[:, 0].double() / WHOLE
     found = Numbers(share, *(share.new_zeros(k, *values.shape[1:]) for values in own))
     for whole, values in zip(found[1:], own, strict=True):
@@ -258,9 +259,9 @@ def _numbers_of(name: str, steps: Tensor, covariances: Tensor) -> Numbers:
     return found
 
 
-def _power(deviation: Tensor) -> Tensor:
+def _power(size: Tensor) -> Tensor:
     """√2 to the power of whole numbers."""
-    return torch.exp2(deviation.double() / 2)
+    return torch.exp2(size.double() / 2)
 
 
 def _basis(name: str, like: Tensor) -> Tensor:

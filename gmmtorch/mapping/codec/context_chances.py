@@ -67,6 +67,7 @@ x5_lLVtu$es)hegya@lYc+<cCe+Kp+3@h8NVO;e(E;?w!+u3#D>R~e$nkIaI2^pPGELObo=U;$+Qrd!l
 }I#|El^ZyO8!mb4
 """
 OF_ATTRIBUTES = """
-c-ouJ$iTqJ$oQWD4*sLiQRNH_s~;@=3zI!}`4X63%&-hhH#adb9QyDZuKPBWxe3besbgR`{S#sOJqA>u1(bJ5u9~%W%PlZ}>bx~O4qOGA+dg&
-jq`DaliuDW(R%Kg`UAY5MKYitiOItwdTIbE#S|7-85U79OtAB9w&OL+BP~{AZ%NQ7*Ald&4&HkCy3=Gc@+8N%U$#-@F-TVi^e~u;(0Ib(P$^
+c-ouJ$iTqJ$oQWD4*sLiNfitXo1V45g~=X2q6((>FfbfIR*ee~lGmtXU~r7goV;@T4KRP&w598}A7x-@Y3o_g-PggO1C$S+c;NDRsQOu(cV7b
+0i>I#ZJ_)4P)H5*D%)j&nX5O5GH^KD$RR^wv=o!@v3_Fj0gWGoiBF(S~%I^jGZ^P!NaQU74AoM{fza41)^dpbq@+-GN=>B*J{j8FK;WZxr&1+
+|1xc?8q|AZ#LxQc<{=5GZ55}N#iCSaJqLl|)D9)x}Y<pTir{!Mr
 """

@@ -1,8 +1,8 @@
 """Attributes that are numbers as an adaptive binary code (`range_coder`): each is predicted from the
 components before it; docs/formats.md.
 
-A row is a component: its share, A deviations, A means, and slopes, as whole numbers (`attribute_block`). The
-fused kernel does the work. This twin defines it.
+A row is a component: its share, A steps as powers of √2, A means and slopes in these steps, as whole numbers
+(`attribute_block`). The fused kernel does the work. This twin defines it.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from gmmtorch.mapping.codec.range_coder import NUMBER, RangeCoder, copied, first
 
 MOST_STEPS = 1 << 40
 """Largest mean and slope."""
-DEVIATIONS = 80
-"""Largest power of √2 of a deviation, and of its inverse."""
+LARGEST_POWER = 80
+"""Largest power of √2 of a step, and of its inverse."""
 WHOLE = 8
 """Parts of a share."""
-_FIELDS = ("SHARE", "FIRST", "SECOND", "LATER", "MEAN", "OTHER", "FLAT", "TILTED", "STEEP", "STEEPER")
+_SLOPES = ("FLAT", "TILTED", "STEEP", "STEEPER")  # of the first column, and of later ones
+_FIELDS = ("SHARE", "FIRST", "SECOND", "LATER", "MEAN", "OTHER", *_SLOPES, *(f"LATER_{s}" for s in _SLOPES))
 _FOLLOWS = 0.6  # how far the expected mean moves to that of the last component
-_LEVEL = 64  # parts of a power, in the running mean of deviations
+_LEVEL = 64  # parts of a power, in their running mean
 _BYTES, _WIDEST = 16, 128  # of a number, usually and at most
 
 
@@ -63,8 +64,8 @@ def read_rows(data: bytes, k: int, n: int, width: int) -> Tensor:
 
 @functools.cache
 def powers() -> Tensor:
-    """√2 to the powers −`DEVIATIONS` … `DEVIATIONS`, equal on all machines."""
-    powers = range(-DEVIATIONS, DEVIATIONS + 1)
+    """√2 to the powers −`LARGEST_POWER` … `LARGEST_POWER`, equal on all machines."""
+    powers = range(-LARGEST_POWER, LARGEST_POWER + 1)
     return torch.tensor([math.ldexp(math.sqrt(2) if d % 2 else 1.0, d // 2) for d in powers]).double()
 
 
@@ -92,24 +93,25 @@ def _walk(coder: RangeCoder, rows: list[list[int]], width: int) -> None:
             raise DataError("A share of the attributes is negative: it is damaged.")
         if row[0] == 0:
             continue
-        deviation, unit = row[1 : 1 + width], [0.0] * width
+        size, step = row[1 : 1 + width], [0.0] * width
         for a in range(width):
-            expected = deviation[a - 1] if a else 0
+            expected = size[a - 1] if a else 0
             if level:
-                shift = (_LEVEL * deviation[a - 1] - level[a - 1]) // 2 if a else 0
+                shift = _LEVEL * size[a - 1] - level[a - 1] if a else 0
                 expected = (level[a] + shift + _LEVEL // 2) // _LEVEL
-            deviation[a] = coded(row, 1 + a, _FIELDS[1 + min(a, 2)], expected, DEVIATIONS)
-            unit[a] = power[deviation[a] + DEVIATIONS]
+            size[a] = coded(row, 1 + a, _FIELDS[1 + min(a, 2)], expected, LARGEST_POWER)
+            step[a] = power[size[a] + LARGEST_POWER]
         for a in range(width):
-            near = math.floor(height[a] * 2 / unit[a] + 0.5) if height else 0
+            near = math.floor(height[a] / step[a] + 0.5) if height else 0
             expected = near if abs(near) < MOST_STEPS else 0
             coded(row, 1 + width + a, "OTHER" if a else "MEAN", expected, MOST_STEPS)
-        steep = 0
-        for place in range(1 + 2 * width, len(row)):
-            steep += abs(coded(row, place, _FIELDS[6 + min(steep, 3)], 0, MOST_STEPS))
-        value = [row[1 + width + a] * unit[a] / 2 for a in range(width)]
+        steep, begin = 0, 1 + 2 * width
+        for place in range(begin, len(row)):
+            first = 6 if (place - begin) * width < len(row) - begin else 10
+            steep += abs(coded(row, place, _FIELDS[first + min(steep, 3)], 0, MOST_STEPS))
+        value = [row[1 + width + a] * step[a] for a in range(width)]
         if level:
             height = [h + _FOLLOWS * (v - h) for h, v in zip(height, value, strict=True)]
-            level = [p + (_LEVEL * d - p) // 4 for p, d in zip(level, deviation, strict=True)]
+            level = [p + (_LEVEL * d - p) // 4 for p, d in zip(level, size, strict=True)]
         else:
-            height, level = value, [_LEVEL * d for d in deviation]
+            height, level = value, [_LEVEL * d for d in size]
