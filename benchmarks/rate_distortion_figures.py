@@ -53,8 +53,8 @@ class Lead(NamedTuple):
     """The longest range of sizes in which one codec needs no more bytes than any other for the same quality.
 
     low, high: its bytes at the ends. octaves: log₂(high/low), 0 if there is no such range. most: largest
-    ratio of the bytes of the best other codec to its own. ended_by: codec that is better above `high`; ""
-    if the curve ends there.
+    ratio of the bytes of the best other codec to its own, where one reaches the quality. ended_by: codec that
+    is better above `high`; "" if the curve ends there.
     """
 
     low: float
@@ -104,12 +104,13 @@ def leads(rows: Rows, quality: str, left_out: Sequence[str] = ()) -> Lead:
         return Lead(math.nan, math.nan, 0.0, 1.0, list(others)[int(needed.min(1).argmin())])
     longest = int((rate[ends] - rate[starts]).argmax())
     first, last = int(starts[longest]), int(ends[longest])
+    led = margin[first : last + 1]
     ended_by = list(others)[int(needed[:, last + 1].argmin())] if last + 1 < len(rate) else ""
     return Lead(
         low=float(2 ** rate[first]),
         high=float(2 ** rate[last]),
         octaves=float(rate[last] - rate[first]),
-        most=float(2 ** margin[first : last + 1].max()),
+        most=float(2 ** led[np.isfinite(led)].max(initial=0.0)),
         ended_by=ended_by,
     )
 

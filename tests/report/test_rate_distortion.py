@@ -57,6 +57,13 @@ def test_lead_compares_with_the_best_codec_that_is_not_left_out():
     assert leads(rows_of(curves), "psnr2_db", left_out=("octree", "draco")).most == pytest.approx(120)
 
 
+def test_a_lead_is_measured_where_another_codec_reaches_the_quality():
+    curves = {"ours": [(100, 50.0), (800, 80.0)], "octree": [(200, 50.0), (800, 70.0)]}
+    lead = leads(rows_of(curves), "auc")
+    assert (lead.low, lead.high) == (pytest.approx(100), pytest.approx(800))
+    assert lead.most == pytest.approx(2)
+
+
 def test_curves_skip_settings_that_a_smaller_one_beats():
     curves = {
         "ours": [(100, 50.0), (150, 40.0), (800, 80.0)],
