@@ -91,6 +91,18 @@ class _Found(NamedTuple):
     contradicted: float
 
 
+class Placement(NamedTuple):
+    """Where some scans lie together: a location of each, with a doubt if the scan does not support it; how
+    much likelier this is than a place that the map does not show, and than the best other place (nats); and
+    the natural logarithm of the number of different poses that were possible.
+    """
+
+    locations: list[Location]
+    total: float
+    lead: float
+    tries: float
+
+
 class LocalMap:
     """The components of some keyframes in one frame.
 
@@ -184,6 +196,50 @@ class LocalMap:
         )
         yield Pose.from_matrix(found.transform[None]), self._targets
 
+    def placed(self, scans: Sequence[Keyframe], near: Pose, reach: float) -> Placement:
+        """Where some scans in 2D, whose poses agree with each other, most likely lie together, by the sum of
+        their evidence: at their poses, or with the first one up to `reach` metres from a pose `near` (1).
+        """
+        first = scans[0].pose
+        ways = [first.inverse() @ scan.pose for scan in scans]
+        some = [scan.points[:_COARSE_POINTS] for scan in scans]
+        cloud = torch.cat([way.apply(points) for way, points in zip(ways, some, strict=True)])
+        cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))]
+        starts = [first[None]]
+        for way, scan in zip(ways, scans, strict=True):
+            around = Expectation(near @ way, math.inf, math.inf, 1.0, reach)
+            starts.append(self._search.best(scan.points, around, _STARTS)[0] @ way.inverse())
+        firsts = Pose.cat(starts)
+        rough = torch.zeros(len(firsts)).double()
+        for way, points in zip(ways, some, strict=True):
+            score = self._targets[0].scores(points[:_RANKED], (firsts @ way).shifted(-self._center))
+            rough += score / CORRELATED + self._seen(points[:_RANKED], firsts @ way)[0]
+        rough[0] = math.inf
+        order = rough.argsort(descending=True, stable=True)
+        firsts = firsts[order[distinct(firsts[order], _APART, _APART / 2)][:_STARTS]]
+        for target in self._targets[:2]:
+            climbed = align(cloud[: 2 * _COARSE_POINTS], target, firsts.shifted(-self._center), _STEPS)
+            firsts = climbed.motions.orthonormal().shifted(self._center)
+        unlimited = Expectation(near, math.inf, math.inf, 1.0, math.inf)
+        nats = []
+        for way, points in zip(ways, some, strict=True):
+            found = align(points, self._targets[1], (firsts @ way).shifted(-self._center), _SLIDE_STEPS)
+            nats.append(self._total(found, points, unlimited)[0] - _UNKNOWN * len(points) / CORRELATED)
+        total = torch.stack(nats).sum(0)
+        best = int(total.argmax())
+        is_apart = differences(firsts, firsts[[best]], _APART, _APART)[:, 0] > 1
+        lead = float(total[best] - torch.where(is_apart, total, -torch.inf).amax())
+        laid = align(cloud, self._targets[-1], firsts[[best]].shifted(-self._center), _STEPS).motions
+        locations = []
+        for way, points, gain in zip(ways, some, nats, strict=True):
+            place = laid.orthonormal().shifted(self._center) @ way
+            seen = align(points, self._targets[-1], place.shifted(-self._center), 0)
+            covariance = pose_covariance(seen.information[0], points)[0]
+            doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
+            locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
+        tries = math.log(math.pi * (reach / _APART) ** 2 * math.pi / _APART)
+        return Placement(locations, float(total[best]), lead, tries)
+
     def _lattice(
         self,
         scan: Keyframe,
@@ -220,9 +276,7 @@ class LocalMap:
         score = (target or self._targets[0]).scores(points, starts.shifted(-self._center))
         total = score / CORRELATED - expected.unlikely(starts)
         best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
-        view = self._space.view(points, starts[best])
-        against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
-        total = total[best] - against * len(points) / CORRELATED
+        total = total[best] + self._seen(points, starts[best])[0]
         return starts[best[total.argsort(descending=True, stable=True)]]
 
     def _climbed(
@@ -253,10 +307,14 @@ class LocalMap:
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
         poses = found.motions.orthonormal().shifted(self._center)
+        seen, view = self._seen(points, poses)
+        return found.evidence * len(points) / CORRELATED + seen - expected.unlikely(poses), view
+
+    def _seen(self, points: Tensor, poses: Pose) -> tuple[Tensor, View]:
+        """Log-likelihood (B,) of points in free space and of unseen ones, nats; and how many there are."""
         view = self._space.view(points, poses)
-        contradicted = view.in_free_space + view.looked_through
-        mean = found.evidence + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
-        return mean * len(points) / CORRELATED - expected.unlikely(poses), view
+        mean = _UNKNOWN * view.unknown - _CONTRADICTED * (view.in_free_space + view.looked_through)
+        return mean * len(points) / CORRELATED, view
 
     def _judged(
         self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.local_map import Keyframe, LocalMap
+from gmmtorch.localization.local_map import Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.pose_graph import Edges, optimised
 from gmmtorch.localization.pose_search import Expectation
@@ -25,6 +25,9 @@ _REACH = 3.0  # metres between the places of a closure, and
 _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
 _FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
+ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
+_TOGETHER = 5  # keyframes after a doubtful motion that are placed together
+_SURE = 5.0  # nats
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
 _SPACING = 3  # every third keyframe looks for closures
 _MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
@@ -51,6 +54,8 @@ def closed(
     edges: Edges,
     places: Sequence[tuple[int, Keyframe]],
     parts: Tensor,
+    doubtful: Sequence[int],
+    max_step: float,
     least_explained: float,
     rule: WindowedRule,
 ) -> tuple[Pose, Edges]:
@@ -60,10 +65,17 @@ def closed(
     Args:
         poses: (N), world ← sensor. edges: of odometry.
         places: number of the pose, and keyframe, in order. parts: (K,), of the keyframes; between two parts
-            the sensor was lost, and the poses of one relative to the other are a guess.
+            the sensor was lost, and the poses of one relative to the other are a guess. doubtful: keyframes
+            in 2D, in order, whose motion from the one before may be wrong: of two scans, by `max_step`
+            metres each.
     """
     tried: set[tuple[int, int]] = set()
-    closures: list[_Closure] = []
+    again = _Again(poses, edges, places, parts, least_explained, rule)
+    again.examine(doubtful, max_step)
+    poses, edges, closures = again.poses, again.edges, again.closures
+    if closures:
+        edges = edges.joined(_edges(closures))
+        poses = optimised(poses, edges, with_covariances=False).poses
     numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     begins = numbers[1:][parts[1:] != parts[:-1]]
     for _ in range(_ROUNDS):
@@ -81,6 +93,69 @@ def closed(
         edges = edges.joined(_edges(found))
         poses = optimised(_put_together(poses, closures, begins), edges, with_covariances=False).poses
     return poses, edges
+
+
+class _Again:
+    """A trajectory in 2D, whose doubtful motions are estimated again from several scans together.
+
+    A motion is replaced if the keyframes after it lie elsewhere in the map of those before it, and this is
+    likelier by far than all other poses. Its edge then becomes loose, and closures take its place.
+    """
+
+    def __init__(
+        self,
+        poses: Pose,
+        edges: Edges,
+        places: Sequence[tuple[int, Keyframe]],
+        parts: Tensor,
+        least_explained: float,
+        rule: WindowedRule,
+    ) -> None:
+        self.poses, self.edges, self.closures = poses, edges, list[_Closure]()
+        self._places, self._parts = places, parts
+        self._least_explained, self._rule = least_explained, rule
+
+    def examine(self, doubtful: Sequence[int], max_step: float) -> None:
+        bounds = [*doubtful, len(self._places)]
+        sure = list(range(bounds[0]))
+        for row, end in zip(bounds, bounds[1:], strict=False):
+            old, new = sure[-2 * _NEIGHBOURS - 1 :], range(row, min(end, row + _TOGETHER))
+            if len(new) < 2:
+                continue
+            local = LocalMap([self._frame(one) for one in old], self._least_explained, self._rule)
+            last, first = self._places[old[-1]][0], self._places[row][0]
+            reach = max_step * min(first - last, 2)
+            found = local.placed([self._frame(one) for one in new], self.poses[[last]], reach)
+            if found.total > _SURE + found.tries and found.lead > _SURE:
+                moved = Pose.from_matrix(found.locations[0].pose) @ self.poses[first].inverse()
+                if self._parts[row] != self._parts[row - 1] or _is_beyond(moved, _AGREE):
+                    self._replace(old, new, found.locations)
+                sure += range(row, end)
+            else:
+                sure = list(range(row, end))
+
+    def _replace(self, old: Sequence[int], new: Sequence[int], locations: Sequence[Location]) -> None:
+        first = self._places[new[0]][0]
+        moved = Pose.from_matrix(locations[0].pose) @ self.poses[first].inverse()
+        self.poses = Pose.cat([self.poses[:first], moved @ self.poses[first:]])
+        edge, source = first - 1, int(self.edges.source[first - 1])
+        motion = self.poses[source].inverse() @ self.poses[first]
+        motions, information = self.edges.motions.matrix, self.edges.information.clone()
+        motions[edge], information[edge] = motion.matrix, torch.linalg.inv(nowhere(motion.dim, *ANYWHERE))
+        self.edges = self.edges._replace(motions=Pose.from_matrix(motions), information=information)
+        for row, location in zip(new, locations, strict=True):
+            if location.found:
+                pose = Pose.from_matrix(location.pose)
+                at = [self._places[one][0] for one in old]
+                nearest = at[int((self.poses.translation[at] - pose.translation).norm(dim=1).argmin())]
+                motion = self.poses[nearest].inverse() @ pose
+                self.closures.append(
+                    _Closure(nearest, self._places[row][0], motion, information_of(location))
+                )
+
+    def _frame(self, row: int) -> Keyframe:
+        number, frame = self._places[row]
+        return frame._replace(pose=self.poses[number])
 
 
 def _put_together(poses: Pose, closures: Sequence[_Closure], begins: Tensor) -> Pose:

@@ -18,7 +18,7 @@ from gmmtorch.datasets import POINT_TIMES, Dataset, Reposed, deskewed, with_pose
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.localization.local_map import LOST, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location, continued, measured_motion
-from gmmtorch.localization.loop_closure import LoopCloser, closed, information_of
+from gmmtorch.localization.loop_closure import ANYWHERE, LoopCloser, closed, information_of
 from gmmtorch.localization.pose_graph import Edges, optimised
 from gmmtorch.localization.pose_search import Expectation
 from gmmtorch.mapping import WindowedRule
@@ -33,7 +33,7 @@ _KEYFRAMES = 10  # in the local map,
 _MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
 _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
-_ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
+_DOUBTED = 0.5  # probability of a pose, below which several scans are searched for together
 _LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
 _APART = "the sensor was lost before, and no place that it saw later is known from before"
 _LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that was found, at most
@@ -119,6 +119,7 @@ class Odometry:
         self._frames: list[int] = []  # scans that are keyframes
         self._last_frame = self._last_found = 0
         self._lost: list[Keyframe] = []  # the last scans, if they were not found
+        self._doubtful: list[int] = []  # keyframes whose motion from the one before may be wrong
         self._parts: list[int] = []  # keyframes that begin a map of their own, because the sensor was lost
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
@@ -224,7 +225,9 @@ class Odometry:
         if loops:
             places = list(zip(self._frames, self.keyframes, strict=True))
             parts = torch.bucketize(torch.arange(len(places)), torch.tensor(self._parts), right=True)
-            poses, edges = closed(poses, edges, places, parts, self.least_explained, self.rule)
+            doubtful = self._doubtful if poses.dim == 2 else []
+            limits = self.max_step, self.least_explained, self.rule
+            poses, edges = closed(poses, edges, places, parts, doubtful, *limits)
         best = optimised(poses, edges)
         used = edges.is_closure & (best.weights > 0.5)
         doubts = tuple("; ".join(location.doubts) for location in self._locations)
@@ -331,10 +334,13 @@ class Odometry:
         if is_new and len(scan.points) >= _FEWEST:
             if begins:
                 if self._edges:  # a closure decides where the new map is, not the guess
-                    anywhere = replace(location, covariance=nowhere(pose.dim, *_ANYWHERE))
+                    anywhere = replace(location, covariance=nowhere(pose.dim, *ANYWHERE))
                     self._edges[-1] = (*self._edges[-1][:2], information_of(anywhere))
                 self._parts.append(len(self.keyframes))
                 self._lost, self._last_found = [], number
+            is_sure = location.found and location.probability >= _DOUBTED and not lost
+            if self.keyframes and not is_sure:
+                self._doubtful.append(len(self.keyframes))
             self._last_frame = number
             self._frames.append(number)
             self.keyframes.append(scan._replace(pose=pose))
