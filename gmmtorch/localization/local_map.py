@@ -69,6 +69,8 @@ _LEAST_OF_SURPRISING = 0.8  # the same, of a pose that has against it, by what w
 _SURPRISING = 4.0  # nats or more
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
+_SURE = 4.6  # nats: odds of 100 to 1
+_LEAD = 10.0  # nats to the best other place: scans share errors
 _ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -92,15 +94,12 @@ class _Found(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Where some scans lie together: a location of each, with a doubt if the scan does not support it; how
-    much likelier this is than a place that the map does not show, and than the best other place (nats); and
-    the natural logarithm of the number of different poses that were possible.
+    """Where some scans lie together: a location of each, with a doubt if the scan does not support it; and
+    whether all other poses are less likely by odds of 100, and so are places that the map does not show.
     """
 
     locations: list[Location]
-    total: float
-    lead: float
-    tries: float
+    is_sure: bool
 
 
 class LocalMap:
@@ -226,9 +225,11 @@ class LocalMap:
             found = align(points, self._targets[1], (firsts @ way).shifted(-self._center), _SLIDE_STEPS)
             nats.append(self._total(found, points, unlimited)[0] - _UNKNOWN * len(points) / CORRELATED)
         total = torch.stack(nats).sum(0)
+        tries = math.log(math.pi * (reach / _APART) ** 2 * math.pi / _APART)
         best = int(total.argmax())
         is_apart = differences(firsts, firsts[[best]], _APART, _APART)[:, 0] > 1
         lead = float(total[best] - torch.where(is_apart, total, -torch.inf).amax())
+        LocalMap.dbg = (float(total[best]), tries, lead, best == 0)
         laid = align(cloud, self._targets[-1], firsts[[best]].shifted(-self._center), _STEPS).motions
         locations = []
         for way, points, gain in zip(ways, some, nats, strict=True):
@@ -237,8 +238,7 @@ class LocalMap:
             covariance = pose_covariance(seen.information[0], points)[0]
             doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
             locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
-        tries = math.log(math.pi * (reach / _APART) ** 2 * math.pi / _APART)
-        return Placement(locations, float(total[best]), lead, tries)
+        return Placement(locations, lead > _LEAD and float(total[best]) > _SURE + tries)
 
     def _lattice(
         self,

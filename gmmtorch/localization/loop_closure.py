@@ -5,13 +5,18 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from gmmtorch.localization.alignment import chosen_rows
 from gmmtorch.localization.local_map import Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.pose_graph import Edges, optimised
@@ -27,7 +32,8 @@ _FARTHEST = 10.0  # metres
 _FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
 ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
 _TOGETHER = 5  # keyframes after a doubtful motion that are placed together
-_SURE = 5.0  # nats
+_DETOUR = 2.0, math.radians(60)  # metres and radians of a way over a pose, more than without it
+_LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
 _SPACING = 3  # every third keyframe looks for closures
 _MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
@@ -49,50 +55,55 @@ class _Closure(NamedTuple):
     information: Tensor
 
 
+class Doubts(NamedTuple):
+    """What may be wrong in a trajectory in 2D: rows of keyframes whose motion from the one before may be, in
+    order; rows of those whose own pose may be; and points of scans that were lost, by number.
+    """
+
+    motions: Sequence[int]
+    keyframes: Sequence[int]
+    lost: Mapping[int, Tensor]
+
+
 def closed(
     poses: Pose,
     edges: Edges,
     places: Sequence[tuple[int, Keyframe]],
     parts: Tensor,
-    doubtful: Sequence[int],
+    doubts: Doubts,
     max_step: float,
     least_explained: float,
     rule: WindowedRule,
-) -> tuple[Pose, Edges]:
-    """Poses near those that agree best, and the edges of a pose graph, with those of the loop closures that
-    can be found.
+) -> tuple[Pose, Edges, set[int]]:
+    """Poses near those that agree best; the edges of a pose graph, with those of the loop closures that can
+    be found; and the numbers of doubtful scans that were found again.
 
     Args:
         poses: (N), world ← sensor. edges: of odometry.
         places: number of the pose, and keyframe, in order. parts: (K,), of the keyframes; between two parts
-            the sensor was lost, and the poses of one relative to the other are a guess. doubtful: keyframes
-            in 2D, in order, whose motion from the one before may be wrong: of two scans, by `max_step`
-            metres each.
+            the sensor was lost, and the poses of one relative to the other are a guess.
+        max_step: metres between two scans.
     """
     tried: set[tuple[int, int]] = set()
-    again = _Again(poses, edges, places, parts, least_explained, rule)
-    again.examine(doubtful, max_step)
-    poses, edges, closures = again.poses, again.edges, again.closures
-    if closures:
-        edges = edges.joined(_edges(closures))
-        poses = optimised(poses, edges, with_covariances=False).poses
+    again = _Again(poses, edges, places, parts, max_step, least_explained, rule)
+    again.examine(doubts.motions)
     numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     begins = numbers[1:][parts[1:] != parts[:-1]]
-    for _ in range(_ROUNDS):
-        at = poses.translation[numbers]
-        pairs = [pair for pair in _candidates(at, parts=parts) if pair not in tried]
+    for number in range(_ROUNDS):
+        poses = again.poses
+        pairs = [pair for pair in _candidates(poses.translation[numbers], parts=parts) if pair not in tried]
         found = [
             edge
             for old, new in pairs
             if (edge := _closure(poses, places, old, new, least_explained, rule, parts))
         ]
         tried.update(pairs)
-        if not found:
+        again.add(found, begins)
+        # Where loops are closed, the map of the scans before a doubtful motion is larger.
+        if not (number == 0 and again.examine()) and not found:
             break
-        closures += found
-        edges = edges.joined(_edges(found))
-        poses = optimised(_put_together(poses, closures, begins), edges, with_covariances=False).poses
-    return poses, edges
+    found_again = again.place(doubts) if poses.dim == 2 else set[int]()
+    return again.poses, again.edges, found_again
 
 
 class _Again:
@@ -108,31 +119,102 @@ class _Again:
         edges: Edges,
         places: Sequence[tuple[int, Keyframe]],
         parts: Tensor,
+        max_step: float,
         least_explained: float,
         rule: WindowedRule,
     ) -> None:
         self.poses, self.edges, self.closures = poses, edges, list[_Closure]()
-        self._places, self._parts = places, parts
+        self._groups: list[list[int]] = []  # of keyframes, between doubtful motions
+        self._places, self._parts, self._max_step = places, parts, max_step
         self._least_explained, self._rule = least_explained, rule
 
-    def examine(self, doubtful: Sequence[int], max_step: float) -> None:
-        bounds = [*doubtful, len(self._places)]
-        sure = list(range(bounds[0]))
-        for row, end in zip(bounds, bounds[1:], strict=False):
-            old, new = sure[-2 * _NEIGHBOURS - 1 :], range(row, min(end, row + _TOGETHER))
-            if len(new) < 2:
+    def examine(self, doubtful: Sequence[int] = ()) -> bool:
+        """Moves the keyframes from each of these rows on to where they lie in the map of those before, if it
+        is sure; also those of earlier calls which were not. Returns whether any was.
+        """
+        bounds = sorted({*doubtful, *(group[0] for group in self._groups), 0, len(self._places)})
+        self._groups = []
+        for first, end in itertools.pairwise(bounds):
+            self._groups.append(list(range(first, end)))
+            while len(self._groups) > 1 and len(self._groups[-1]) > 1:
+                below = next((one for one in (2, 3) if self._joins(self._groups[-one:])), None)
+                if below is None:
+                    break
+                self._groups[-below:] = [self._groups[-below] + self._groups[-1]]
+        return len(self._groups) + 1 < len(bounds)
+
+    def add(self, closures: Sequence[_Closure], begins: Tensor) -> None:
+        """Corrects the poses by closures. begins: as for `_put_together`."""
+        if closures:
+            self.closures += closures
+            self.edges = self.edges.joined(_edges(closures))
+            poses = _put_together(self.poses, self.closures, begins)
+            self.poses = optimised(poses, self.edges, with_covariances=False).poses
+
+    def _joins(self, groups: Sequence[Sequence[int]]) -> bool:
+        """Whether the first scans of the last group surely lie in the map of the first one; moves them."""
+        new, last = groups[-1][:_TOGETHER], self._places[groups[0][-1]][0]
+        first = self._places[new[0]][0]
+        old = self._around(groups[0])
+        reach = self._max_step * min(first - last, 2)
+        local = LocalMap([self._frame(one) for one in old], self._least_explained, self._rule)
+        found = local.placed([self._frame(one) for one in new], self.poses[[last]], reach)
+        moved = Pose.from_matrix(found.locations[0].pose) @ self.poses[first].inverse()
+        if found.is_sure and (self._parts[new[0]] != self._parts[new[0] - 1] or _is_beyond(moved, _AGREE)):
+            self._replace(old, new, found.locations)
+        return found.is_sure
+
+    def _around(self, rows: Sequence[int]) -> list[int]:
+        """The last keyframes of some, and the nearest to the last one of the others."""
+        n = 2 * _NEIGHBOURS + 1
+        others = rows[: -max(_APART, n)]
+        at = self.poses.translation[[self._places[row][0] for row in [*others, rows[-1]]]]
+        gaps = (at[:-1] - at[-1]).norm(dim=1)
+        nearest = [others[one] for one in gaps.argsort()[:n].tolist() if float(gaps[one]) < _FARTHEST]
+        return [*nearest, *rows[-n:]]
+
+    def place(self, doubts: Doubts) -> set[int]:
+        """Places lost scans and doubtful keyframes in the map of the keyframes on both sides of each; returns
+        the numbers of those that lie there for sure.
+        """
+        numbers = [number for number, _ in self._places]
+        at = self.poses[numbers]
+        detours = {row for row in range(1, len(at) - 1) if _is_detour(at[row - 1 : row + 2])}
+        doubtful = detours | set(doubts.keyframes) - {0}
+        group, found = joined(self._parts, self.edges, numbers), set[int]()
+        scans = dict(doubts.lost) | {numbers[row]: self._places[row][1].points for row in doubtful}
+        for number in sorted(scans):
+            row = bisect.bisect_left(numbers, number)
+            if row == 0:
                 continue
-            local = LocalMap([self._frame(one) for one in old], self._least_explained, self._rule)
-            last, first = self._places[old[-1]][0], self._places[row][0]
-            reach = max_step * min(first - last, 2)
-            found = local.placed([self._frame(one) for one in new], self.poses[[last]], reach)
-            if found.total > _SURE + found.tries and found.lead > _SURE:
-                moved = Pose.from_matrix(found.locations[0].pose) @ self.poses[first].inverse()
-                if self._parts[row] != self._parts[row - 1] or _is_beyond(moved, _AGREE):
-                    self._replace(old, new, found.locations)
-                sure += range(row, end)
-            else:
-                sure = list(range(row, end))
+            scan, last = Keyframe(scans[number], self.poses[number]), numbers[row - 1]
+            near = [one for one in range(max(row - _NEIGHBOURS, 0), min(row + _NEIGHBOURS + 1, len(numbers)))
+                    if numbers[one] != number and group[one] == group[row - 1]]  # fmt: skip
+            if len(near) < 2:
+                continue
+            local = LocalMap([self._frame(one) for one in near], self._least_explained, self._rule)
+            placed = local.placed([scan], self.poses[[last]], 2 * self._max_step)
+            pose = Pose.from_matrix(placed.locations[0].pose)
+            if not placed.is_sure or not placed.locations[0].found:
+                continue
+            found.add(number)
+            if number in doubts.lost or _is_beyond(pose @ scan.pose.inverse(), _AGREE):
+                self._set(number, last, pose, information_of(placed.locations[0]))
+        return found
+
+    def _set(self, number: int, last: int, pose: Pose, information: Tensor) -> None:
+        """Replaces the pose of one scan by that relative to another one, on which those that hung on it hang."""
+        source, target, motions, every, is_closure = self.edges
+        kept = ~(is_closure & ((source == number) | (target == number)))
+        moved = (source == number) & ~is_closure
+        source, every = torch.where(moved, last, source), every.clone()
+        before = self.poses[last].inverse()
+        motions = Pose(*chosen_rows(moved, (before @ self.poses[target]).parts, motions.parts))
+        motion = before @ pose
+        source[number - 1], every[number - 1] = last, information
+        motions.rotation[number - 1], motions.translation[number - 1] = motion.rotation, motion.translation
+        self.edges = Edges(source, target, motions, every, is_closure).at(kept.nonzero()[:, 0])
+        self.poses.rotation[number], self.poses.translation[number] = pose.rotation, pose.translation
 
     def _replace(self, old: Sequence[int], new: Sequence[int], locations: Sequence[Location]) -> None:
         first = self._places[new[0]][0]
@@ -143,19 +225,38 @@ class _Again:
         motions, information = self.edges.motions.matrix, self.edges.information.clone()
         motions[edge], information[edge] = motion.matrix, torch.linalg.inv(nowhere(motion.dim, *ANYWHERE))
         self.edges = self.edges._replace(motions=Pose.from_matrix(motions), information=information)
+        closures = []
         for row, location in zip(new, locations, strict=True):
             if location.found:
                 pose = Pose.from_matrix(location.pose)
                 at = [self._places[one][0] for one in old]
                 nearest = at[int((self.poses.translation[at] - pose.translation).norm(dim=1).argmin())]
                 motion = self.poses[nearest].inverse() @ pose
-                self.closures.append(
-                    _Closure(nearest, self._places[row][0], motion, information_of(location))
-                )
+                closures.append(_Closure(nearest, self._places[row][0], motion, information_of(location)))
+        self.add(closures, torch.zeros(0).long())
 
     def _frame(self, row: int) -> Keyframe:
         number, frame = self._places[row]
         return frame._replace(pose=self.poses[number])
+
+
+def _is_detour(poses: Pose) -> bool:
+    """Whether the second of three poses is far from the way of the others."""
+    before, after, across = (poses[one].inverse() @ poses[other] for one, other in ((0, 1), (1, 2), (0, 2)))
+    far = before.translation.norm() + after.translation.norm() - across.translation.norm()
+    return bool(far > _DETOUR[0]) or bool(before.angle() + after.angle() - across.angle() > _DETOUR[1])
+
+
+def joined(parts: Tensor, edges: Edges, numbers: Sequence[int]) -> Tensor:
+    """Numbers (K,) of the groups of parts of keyframes which closures join, directly or not."""
+    rows = torch.tensor(numbers)
+    closures = edges.at(edges.is_closure.nonzero()[:, 0])
+    ends = [parts[torch.searchsorted(rows, end, right=True) - 1] for end in (closures.source, closures.target)]
+    n = int(parts.max()) + 1
+    links = coo_matrix((torch.ones(len(ends[0])).numpy(), (ends[0].numpy(), ends[1].numpy())), shape=(n, n)).tocsr()
+    links = links + links.T >= _LEAST_CLOSURES
+    _, group = connected_components(links, directed=False)
+    return torch.from_numpy(group)[parts]
 
 
 def _put_together(poses: Pose, closures: Sequence[_Closure], begins: Tensor) -> Pose:
