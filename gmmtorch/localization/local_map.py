@@ -70,7 +70,7 @@ _SURPRISING = 4.0  # nats or more
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
 _SURE = 4.6  # nats: odds of 100 to 1
-_LEAD = 10.0  # nats to the best other place: scans share errors
+_LEAD = 10.0  # nats to the best other place: the points of a wall share errors
 _ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -229,7 +229,6 @@ class LocalMap:
         best = int(total.argmax())
         is_apart = differences(firsts, firsts[[best]], _APART, _APART)[:, 0] > 1
         lead = float(total[best] - torch.where(is_apart, total, -torch.inf).amax())
-        LocalMap.dbg = (float(total[best]), tries, lead, best == 0)
         laid = align(cloud, self._targets[-1], firsts[[best]].shifted(-self._center), _STEPS).motions
         locations = []
         for way, points, gain in zip(ways, some, nats, strict=True):

@@ -9,10 +9,10 @@ import bisect
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
@@ -31,7 +31,10 @@ _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
 _FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
 ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
-_TOGETHER = 5  # keyframes after a doubtful motion that are placed together
+_STEP = 1.0, math.radians(30)  # deviations (m, rad) of a motion that nothing predicts
+_LEAST_PROBABILITY = 0.8  # of a scan that leads to a keyframe
+_FEWEST = 3  # scans before and after a doubtful motion, at least, and
+_TOGETHER = 6  # keyframes after a doubtful motion that are placed together
 _DETOUR = 2.0, math.radians(60)  # metres and radians of a way over a pose, more than without it
 _LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
@@ -43,6 +46,7 @@ _SYSTEMATIC = {  # deviations (m, rad) of errors that the points do not show, su
 }
 _ANGLE = math.radians(10)  # of the heading of a closure
 _AGREE = 0.3, math.radians(3)  # metres and radians: two closures agree
+_ELSEWHERE = 0.3, 0.3  # metres and radians: two poses are different places
 _NOTICED = 0.03, math.radians(0.3)  # metres and radians: a closure changes the poses
 
 
@@ -85,11 +89,11 @@ def closed(
         max_step: metres between two scans.
     """
     tried: set[tuple[int, int]] = set()
-    again = _Again(poses, edges, places, parts, max_step, least_explained, rule)
+    again = _Again(poses, edges, places, parts, doubts.lost, max_step, least_explained, rule)
     again.examine(doubts.motions)
     numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     begins = numbers[1:][parts[1:] != parts[:-1]]
-    for number in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         poses = again.poses
         pairs = [pair for pair in _candidates(poses.translation[numbers], parts=parts) if pair not in tried]
         found = [
@@ -99,18 +103,18 @@ def closed(
         ]
         tried.update(pairs)
         again.add(found, begins)
-        # Where loops are closed, the map of the scans before a doubtful motion is larger.
-        if not (number == 0 and again.examine()) and not found:
+        if not found:
             break
     found_again = again.place(doubts) if poses.dim == 2 else set[int]()
     return again.poses, again.edges, found_again
 
 
 class _Again:
-    """A trajectory in 2D, whose doubtful motions are estimated again from several scans together.
+    """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans.
 
-    A motion is replaced if the keyframes after it lie elsewhere in the map of those before it, and this is
-    likelier by far than all other poses. Its edge then becomes loose, and closures take its place.
+    A motion is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and
+    this is likelier by far than all other poses. A pose is replaced, in the same way, by that in the map of
+    the keyframes on both sides.
     """
 
     def __init__(
@@ -119,29 +123,43 @@ class _Again:
         edges: Edges,
         places: Sequence[tuple[int, Keyframe]],
         parts: Tensor,
+        lost: Mapping[int, Tensor],
         max_step: float,
         least_explained: float,
         rule: WindowedRule,
     ) -> None:
         self.poses, self.edges, self.closures = poses, edges, list[_Closure]()
-        self._groups: list[list[int]] = []  # of keyframes, between doubtful motions
-        self._places, self._parts, self._max_step = places, parts, max_step
+        self._numbers, self._parts, self._max_step = [number for number, _ in places], parts, max_step
+        self._points = dict(lost) | {number: frame.points for number, frame in places}
         self._least_explained, self._rule = least_explained, rule
 
-    def examine(self, doubtful: Sequence[int] = ()) -> bool:
-        """Moves the keyframes from each of these rows on to where they lie in the map of those before, if it
-        is sure; also those of earlier calls which were not. Returns whether any was.
-        """
-        bounds = sorted({*doubtful, *(group[0] for group in self._groups), 0, len(self._places)})
-        self._groups = []
-        for first, end in itertools.pairwise(bounds):
-            self._groups.append(list(range(first, end)))
-            while len(self._groups) > 1 and len(self._groups[-1]) > 1:
-                below = next((one for one in (2, 3) if self._joins(self._groups[-one:])), None)
+    def examine(self, doubtful: Sequence[int]) -> None:
+        """Moves the keyframes from each of these rows on, and the lost scans that led there, to where they
+        lie in the map of those before, if it is sure."""
+        groups: list[list[int]] = []
+        for first, end in itertools.pairwise([0, *doubtful, len(self._numbers)]):
+            group = self._numbers[first:end]
+            groups.append([*self._led(group), *group] if first else group)
+            while len(groups) > 1:
+                below = next((one for one in (2, 3) if self._joins(groups[-one:])), None)
                 if below is None:
                     break
-                self._groups[-below:] = [self._groups[-below] + self._groups[-1]]
-        return len(self._groups) + 1 < len(bounds)
+                groups[-below:] = [groups[-below] + groups[-1]]
+
+    def _led(self, group: Sequence[int]) -> list[int]:
+        """The lost scans right before some keyframes that surely lie in their map, which it moves there."""
+        led: list[int] = []
+        number = group[0] - 1
+        while number in self._points and number not in self._numbers:
+            local = self._local([*group[:_TOGETHER][::-1], *led[::-1]])
+            near = Expectation(self.poses[[number + 1]], *_STEP, 1.0, self._max_step)
+            location = local.locate(Keyframe(self._points[number], near.poses[0]), near)
+            if not location.found or location.probability < _LEAST_PROBABILITY:
+                break
+            self._set(number, group[0], Pose.from_matrix(location.pose), information_of(location))
+            led.insert(0, number)
+            number -= 1
+        return led
 
     def add(self, closures: Sequence[_Closure], begins: Tensor) -> None:
         """Corrects the poses by closures. begins: as for `_put_together`."""
@@ -152,58 +170,55 @@ class _Again:
             self.poses = optimised(poses, self.edges, with_covariances=False).poses
 
     def _joins(self, groups: Sequence[Sequence[int]]) -> bool:
-        """Whether the first scans of the last group surely lie in the map of the first one; moves them."""
-        new, last = groups[-1][:_TOGETHER], self._places[groups[0][-1]][0]
-        first = self._places[new[0]][0]
-        old = self._around(groups[0])
-        reach = self._max_step * min(first - last, 2)
-        local = LocalMap([self._frame(one) for one in old], self._least_explained, self._rule)
-        found = local.placed([self._frame(one) for one in new], self.poses[[last]], reach)
-        moved = Pose.from_matrix(found.locations[0].pose) @ self.poses[first].inverse()
-        if found.is_sure and (self._parts[new[0]] != self._parts[new[0] - 1] or _is_beyond(moved, _AGREE)):
-            self._replace(old, new, found.locations)
+        """Whether the first scans of the last group surely lie in the map of the first one's last; moves
+        them."""
+        old, new = groups[0][-2 * _NEIGHBOURS - 1 :], groups[-1][:_TOGETHER]
+        if min(len(old), len(new)) < _FEWEST:
+            return False
+        reach = self._max_step * min(new[0] - old[-1], 2)
+        found = self._local(old).placed([self._frame(one) for one in new], self.poses[[old[-1]]], reach)
+        pose, before = Pose.from_matrix(found.locations[0].pose), self.poses[new[0]]
+        first = next(one for one in groups[-1] if one in self._numbers)
+        row = self._numbers.index(first)
+        is_elsewhere = _is_beyond(before.inverse() @ pose, _ELSEWHERE)
+        if found.is_sure and (is_elsewhere or self._parts[row] != self._parts[row - 1]):
+            moved = pose @ before.inverse() @ self.poses[new[0] :]
+            self.poses = Pose.cat([self.poses[: new[0]], moved])
+            self._replace(old[-1], first, found.locations)
         return found.is_sure
-
-    def _around(self, rows: Sequence[int]) -> list[int]:
-        """The last keyframes of some, and the nearest to the last one of the others."""
-        n = 2 * _NEIGHBOURS + 1
-        others = rows[: -max(_APART, n)]
-        at = self.poses.translation[[self._places[row][0] for row in [*others, rows[-1]]]]
-        gaps = (at[:-1] - at[-1]).norm(dim=1)
-        nearest = [others[one] for one in gaps.argsort()[:n].tolist() if float(gaps[one]) < _FARTHEST]
-        return [*nearest, *rows[-n:]]
 
     def place(self, doubts: Doubts) -> set[int]:
         """Places lost scans and doubtful keyframes in the map of the keyframes on both sides of each; returns
         the numbers of those that lie there for sure.
         """
-        numbers = [number for number, _ in self._places]
+        numbers, found = self._numbers, set[int]()
+        if not numbers:
+            return found
         at = self.poses[numbers]
         detours = {row for row in range(1, len(at) - 1) if _is_detour(at[row - 1 : row + 2])}
         doubtful = detours | set(doubts.keyframes) - {0}
-        group, found = joined(self._parts, self.edges, numbers), set[int]()
-        scans = dict(doubts.lost) | {numbers[row]: self._places[row][1].points for row in doubtful}
-        for number in sorted(scans):
+        group = joined(self._parts, self.edges, numbers)
+        for number in sorted({*doubts.lost, *(numbers[row] for row in doubtful)}):
             row = bisect.bisect_left(numbers, number)
             if row == 0:
                 continue
-            scan, last = Keyframe(scans[number], self.poses[number]), numbers[row - 1]
-            near = [one for one in range(max(row - _NEIGHBOURS, 0), min(row + _NEIGHBOURS + 1, len(numbers)))
-                    if numbers[one] != number and group[one] == group[row - 1]]  # fmt: skip
+            scan, last = self._frame(number), numbers[row - 1]
+            around = range(max(row - _NEIGHBOURS, 0), min(row + _NEIGHBOURS + 1, len(numbers)))
+            mates = [numbers[one] for one in around if group[one] == group[row - 1]]
+            near = [one for one in mates if one != number]
             if len(near) < 2:
                 continue
-            local = LocalMap([self._frame(one) for one in near], self._least_explained, self._rule)
-            placed = local.placed([scan], self.poses[[last]], 2 * self._max_step)
+            placed = self._local(near).placed([scan], self.poses[[last]], 2 * self._max_step)
             pose = Pose.from_matrix(placed.locations[0].pose)
             if not placed.is_sure or not placed.locations[0].found:
                 continue
             found.add(number)
-            if number in doubts.lost or _is_beyond(pose @ scan.pose.inverse(), _AGREE):
+            if number in doubts.lost or _is_beyond(scan.pose.inverse() @ pose, _ELSEWHERE):
                 self._set(number, last, pose, information_of(placed.locations[0]))
         return found
 
     def _set(self, number: int, last: int, pose: Pose, information: Tensor) -> None:
-        """Replaces the pose of one scan by that relative to another one, on which those that hung on it hang."""
+        """Replaces the pose of a scan by that relative to another one, on which all that hung on it hangs."""
         source, target, motions, every, is_closure = self.edges
         kept = ~(is_closure & ((source == number) | (target == number)))
         moved = (source == number) & ~is_closure
@@ -216,28 +231,23 @@ class _Again:
         self.edges = Edges(source, target, motions, every, is_closure).at(kept.nonzero()[:, 0])
         self.poses.rotation[number], self.poses.translation[number] = pose.rotation, pose.translation
 
-    def _replace(self, old: Sequence[int], new: Sequence[int], locations: Sequence[Location]) -> None:
-        first = self._places[new[0]][0]
-        moved = Pose.from_matrix(locations[0].pose) @ self.poses[first].inverse()
-        self.poses = Pose.cat([self.poses[:first], moved @ self.poses[first:]])
+    def _replace(self, last: int, first: int, locations: Sequence[Location]) -> None:
+        """Makes the edge to a scan loose; a closure as exact as the best location takes its place."""
         edge, source = first - 1, int(self.edges.source[first - 1])
         motion = self.poses[source].inverse() @ self.poses[first]
         motions, information = self.edges.motions.matrix, self.edges.information.clone()
         motions[edge], information[edge] = motion.matrix, torch.linalg.inv(nowhere(motion.dim, *ANYWHERE))
         self.edges = self.edges._replace(motions=Pose.from_matrix(motions), information=information)
-        closures = []
-        for row, location in zip(new, locations, strict=True):
-            if location.found:
-                pose = Pose.from_matrix(location.pose)
-                at = [self._places[one][0] for one in old]
-                nearest = at[int((self.poses.translation[at] - pose.translation).norm(dim=1).argmin())]
-                motion = self.poses[nearest].inverse() @ pose
-                closures.append(_Closure(nearest, self._places[row][0], motion, information_of(location)))
-        self.add(closures, torch.zeros(0).long())
+        sharpest = min(locations, key=lambda one: float(one.covariance.trace()))
+        location = replace(sharpest, pose=self.poses[first].matrix)
+        motion = self.poses[last].inverse() @ self.poses[first]
+        self.add([_Closure(last, first, motion, information_of(location))], torch.zeros(0).long())
 
-    def _frame(self, row: int) -> Keyframe:
-        number, frame = self._places[row]
-        return frame._replace(pose=self.poses[number])
+    def _frame(self, number: int) -> Keyframe:
+        return Keyframe(self._points[number], self.poses[number])
+
+    def _local(self, numbers: Sequence[int]) -> LocalMap:
+        return LocalMap([self._frame(one) for one in numbers], self._least_explained, self._rule)
 
 
 def _is_detour(poses: Pose) -> bool:
@@ -248,15 +258,15 @@ def _is_detour(poses: Pose) -> bool:
 
 
 def joined(parts: Tensor, edges: Edges, numbers: Sequence[int]) -> Tensor:
-    """Numbers (K,) of the groups of parts of keyframes which closures join, directly or not."""
+    """The group (K,) of each keyframe: closures join its part (K,), counted from 1, directly or not."""
     rows = torch.tensor(numbers)
     closures = edges.at(edges.is_closure.nonzero()[:, 0])
-    ends = [parts[torch.searchsorted(rows, end, right=True) - 1] for end in (closures.source, closures.target)]
-    n = int(parts.max()) + 1
-    links = coo_matrix((torch.ones(len(ends[0])).numpy(), (ends[0].numpy(), ends[1].numpy())), shape=(n, n)).tocsr()
-    links = links + links.T >= _LEAST_CLOSURES
-    _, group = connected_components(links, directed=False)
-    return torch.from_numpy(group)[parts]
+    both = closures.source, closures.target
+    ends = [parts[torch.searchsorted(rows, end, right=True) - 1] - 1 for end in both]
+    n = int(parts.max())
+    counts = torch.zeros(n, n).index_put_(tuple(ends), torch.ones(1), accumulate=True)
+    _, group = connected_components((counts + counts.T >= _LEAST_CLOSURES).numpy(), directed=False)
+    return torch.from_numpy(group)[parts - 1]
 
 
 def _put_together(poses: Pose, closures: Sequence[_Closure], begins: Tensor) -> Pose:

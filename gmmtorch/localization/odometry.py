@@ -226,10 +226,11 @@ class Odometry:
             parts = torch.bucketize(torch.arange(len(places)), torch.tensor(self._parts), right=True)
             limits = self.max_step, self.least_explained, self.rule
             poses, edges, again = closed(poses, edges, places, parts, self._doubts(), *limits)
-            found[list(again)] = True
+            found[sorted(again)] = True
         best = optimised(poses, edges)
         used = edges.is_closure & (best.weights > 0.5)
-        doubts = tuple("; ".join(location.doubts) for location in self._locations)
+        doubts = tuple("" if good else "; ".join(location.doubts)
+                       for good, location in zip(found.tolist(), self._locations, strict=True))  # fmt: skip
         is_apart = self._is_apart(edges.at(used.nonzero()[:, 0]))
         doubts = tuple(f"{doubt}; {_APART}" if apart and doubt else _APART if apart else doubt
                        for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
