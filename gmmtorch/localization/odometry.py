@@ -75,7 +75,8 @@ class Odometry:
     pose, from a wider lattice and from other headings. `trajectory` finds the places that were seen twice and
     corrects all poses by a pose graph (`localization.pose_graph`). A scan that is not found never enters the
     local map. If the next one is found, it is searched for again. The fourth in a row begins a new map, whose
-    poses are found if two closures that agree join it with the first.
+    poses are found if two closures that agree join it with the first. In 2D `trajectory` estimates doubtful
+    motions and the poses of lost scans again, from several scans before and after them.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
