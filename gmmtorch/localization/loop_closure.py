@@ -31,8 +31,6 @@ _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
 _FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
 ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
-_STEP = 1.0, math.radians(30)  # deviations (m, rad) of a motion that nothing predicts
-_LEAST_PROBABILITY = 0.8  # of a scan that leads to a keyframe
 _FEWEST = 3  # scans before and after a doubtful motion, at least, and
 _TOGETHER = 6  # keyframes after a doubtful motion that are placed together
 _DETOUR = 2.0, math.radians(60)  # metres and radians of a way over a pose, more than without it
@@ -80,7 +78,7 @@ def closed(
     rule: WindowedRule,
 ) -> tuple[Pose, Edges, set[int]]:
     """Poses near those that agree best; the edges of a pose graph, with those of the loop closures that can
-    be found; and the numbers of doubtful scans that were found again.
+    be found; and the numbers of doubtful scans that were found revision.
 
     Args:
         poses: (N), world ← sensor. edges: of odometry.
@@ -89,12 +87,12 @@ def closed(
         max_step: metres between two scans.
     """
     tried: set[tuple[int, int]] = set()
-    again = _Again(poses, edges, places, parts, doubts.lost, max_step, least_explained, rule)
-    again.examine(doubts.motions)
+    revision = _Revision(poses, edges, places, parts, doubts.lost, max_step, least_explained, rule)
+    revision.examine(doubts.motions)
     numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     begins = numbers[1:][parts[1:] != parts[:-1]]
     for _ in range(_ROUNDS):
-        poses = again.poses
+        poses = revision.poses
         pairs = [pair for pair in _candidates(poses.translation[numbers], parts=parts) if pair not in tried]
         found = [
             edge
@@ -102,14 +100,14 @@ def closed(
             if (edge := _closure(poses, places, old, new, least_explained, rule, parts))
         ]
         tried.update(pairs)
-        again.add(found, begins)
+        revision.add(found, begins)
         if not found:
             break
-    found_again = again.place(doubts) if poses.dim == 2 else set[int]()
-    return again.poses, again.edges, found_again
+    found_again = revision.place(doubts) if poses.dim == 2 else set[int]()
+    return revision.poses, revision.edges, found_again
 
 
-class _Again:
+class _Revision:
     """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans.
 
     A motion is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and
@@ -134,32 +132,15 @@ class _Again:
         self._least_explained, self._rule = least_explained, rule
 
     def examine(self, doubtful: Sequence[int]) -> None:
-        """Moves the keyframes from each of these rows on, and the lost scans that led there, to where they
-        lie in the map of those before, if it is sure."""
+        """Moves the keyframes from each of these rows on to where the map of those before surely has them."""
         groups: list[list[int]] = []
         for first, end in itertools.pairwise([0, *doubtful, len(self._numbers)]):
-            group = self._numbers[first:end]
-            groups.append([*self._led(group), *group] if first else group)
+            groups.append(self._numbers[first:end])
             while len(groups) > 1:
                 below = next((one for one in (2, 3) if self._joins(groups[-one:])), None)
                 if below is None:
                     break
                 groups[-below:] = [groups[-below] + groups[-1]]
-
-    def _led(self, group: Sequence[int]) -> list[int]:
-        """The lost scans right before some keyframes that surely lie in their map, which it moves there."""
-        led: list[int] = []
-        number = group[0] - 1
-        while number in self._points and number not in self._numbers:
-            local = self._local([*group[:_TOGETHER][::-1], *led[::-1]])
-            near = Expectation(self.poses[[number + 1]], *_STEP, 1.0, self._max_step)
-            location = local.locate(Keyframe(self._points[number], near.poses[0]), near)
-            if not location.found or location.probability < _LEAST_PROBABILITY:
-                break
-            self._set(number, group[0], Pose.from_matrix(location.pose), information_of(location))
-            led.insert(0, number)
-            number -= 1
-        return led
 
     def add(self, closures: Sequence[_Closure], begins: Tensor) -> None:
         """Corrects the poses by closures. begins: as for `_put_together`."""
@@ -178,13 +159,12 @@ class _Again:
         reach = self._max_step * min(new[0] - old[-1], 2)
         found = self._local(old).placed([self._frame(one) for one in new], self.poses[[old[-1]]], reach)
         pose, before = Pose.from_matrix(found.locations[0].pose), self.poses[new[0]]
-        first = next(one for one in groups[-1] if one in self._numbers)
-        row = self._numbers.index(first)
+        row = self._numbers.index(new[0])
         is_elsewhere = _is_beyond(before.inverse() @ pose, _ELSEWHERE)
         if found.is_sure and (is_elsewhere or self._parts[row] != self._parts[row - 1]):
             moved = pose @ before.inverse() @ self.poses[new[0] :]
             self.poses = Pose.cat([self.poses[: new[0]], moved])
-            self._replace(old[-1], first, found.locations)
+            self._replace(old[-1], new[0], found.locations)
         return found.is_sure
 
     def place(self, doubts: Doubts) -> set[int]:
