@@ -69,6 +69,8 @@ _LEAST_OF_SURPRISING = 0.8  # the same, of a pose that has against it, by what w
 _SURPRISING = 4.0  # nats or more
 _LEAST_SEEN = 0.5  # share of the points of which at least so many must lie on surfaces
 _USUAL = 0.85  # of the share that is expected to be explained: less, and the search is wider
+_SURE = 4.6  # nats: odds of 100 to 1
+_LEAD = 10.0  # nats to the best other place: the points of a wall share errors
 _ALIKE = 2.0  # nats by which another pose must be worse
 _IMAGE_CELL = {2: math.radians(1), 3: math.radians(3)}  # of an image
 _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look through
@@ -89,6 +91,15 @@ class _Found(NamedTuple):
     location: Location
     total: float
     contradicted: float
+
+
+class Placement(NamedTuple):
+    """Where some scans lie together: a location of each, with a doubt if the scan does not support it; and
+    whether all other poses are less likely by odds of 100, and so are places that the map does not show.
+    """
+
+    locations: list[Location]
+    is_sure: bool
 
 
 class LocalMap:
@@ -184,6 +195,50 @@ class LocalMap:
         )
         yield Pose.from_matrix(found.transform[None]), self._targets
 
+    def placed(self, scans: Sequence[Keyframe], near: Pose, reach: float) -> Placement:
+        """Where some scans in 2D, whose poses agree with each other, most likely lie together, by the sum of
+        their evidence: at their poses, or with the first one up to `reach` metres from a pose `near` (1).
+        """
+        first = scans[0].pose
+        ways = [first.inverse() @ scan.pose for scan in scans]
+        some = [scan.points[:_COARSE_POINTS] for scan in scans]
+        cloud = torch.cat([way.apply(points) for way, points in zip(ways, some, strict=True)])
+        cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))]
+        starts = [first[None]]
+        for way, scan in zip(ways, scans, strict=True):
+            around = Expectation(near @ way, math.inf, math.inf, 1.0, reach)
+            starts.append(self._search.best(scan.points, around, _STARTS)[0] @ way.inverse())
+        firsts = Pose.cat(starts)
+        rough = torch.zeros(len(firsts)).double()
+        for way, points in zip(ways, some, strict=True):
+            score = self._targets[0].scores(points[:_RANKED], (firsts @ way).shifted(-self._center))
+            rough += score / CORRELATED + self._seen(points[:_RANKED], firsts @ way)[0]
+        rough[0] = math.inf
+        order = rough.argsort(descending=True, stable=True)
+        firsts = firsts[order[distinct(firsts[order], _APART, _APART / 2)][:_STARTS]]
+        for target in self._targets[:2]:
+            climbed = align(cloud[: 2 * _COARSE_POINTS], target, firsts.shifted(-self._center), _STEPS)
+            firsts = climbed.motions.orthonormal().shifted(self._center)
+        unlimited = Expectation(near, math.inf, math.inf, 1.0, math.inf)
+        nats = []
+        for way, points in zip(ways, some, strict=True):
+            found = align(points, self._targets[1], (firsts @ way).shifted(-self._center), _SLIDE_STEPS)
+            nats.append(self._total(found, points, unlimited)[0] - _UNKNOWN * len(points) / CORRELATED)
+        total = torch.stack(nats).sum(0)
+        tries = math.log(math.pi * (reach / _APART) ** 2 * math.pi / _APART)
+        best = int(total.argmax())
+        is_apart = differences(firsts, firsts[[best]], _APART, _APART)[:, 0] > 1
+        lead = float(total[best] - torch.where(is_apart, total, -torch.inf).amax())
+        laid = align(cloud, self._targets[-1], firsts[[best]].shifted(-self._center), _STEPS).motions
+        locations = []
+        for way, points, gain in zip(ways, some, nats, strict=True):
+            place = laid.orthonormal().shifted(self._center) @ way
+            seen = align(points, self._targets[-1], place.shifted(-self._center), 0)
+            covariance = pose_covariance(seen.information[0], points)[0]
+            doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
+            locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
+        return Placement(locations, lead > _LEAD and float(total[best]) > _SURE + tries)
+
     def _lattice(
         self,
         scan: Keyframe,
@@ -220,9 +275,7 @@ class LocalMap:
         score = (target or self._targets[0]).scores(points, starts.shifted(-self._center))
         total = score / CORRELATED - expected.unlikely(starts)
         best = total.argsort(descending=True, stable=True)[: _SORTED[self.dim]]
-        view = self._space.view(points, starts[best])
-        against = _CONTRADICTED * (view.in_free_space + view.looked_through) - _UNKNOWN * view.unknown
-        total = total[best] - against * len(points) / CORRELATED
+        total = total[best] + self._seen(points, starts[best])[0]
         return starts[best[total.argsort(descending=True, stable=True)]]
 
     def _climbed(
@@ -253,10 +306,14 @@ class LocalMap:
     def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
         poses = found.motions.orthonormal().shifted(self._center)
+        seen, view = self._seen(points, poses)
+        return found.evidence * len(points) / CORRELATED + seen - expected.unlikely(poses), view
+
+    def _seen(self, points: Tensor, poses: Pose) -> tuple[Tensor, View]:
+        """Log-likelihood (B,) of points in free space and of unseen ones, nats; and how many there are."""
         view = self._space.view(points, poses)
-        contradicted = view.in_free_space + view.looked_through
-        mean = found.evidence + _UNKNOWN * view.unknown - _CONTRADICTED * contradicted
-        return mean * len(points) / CORRELATED - expected.unlikely(poses), view
+        mean = _UNKNOWN * view.unknown - _CONTRADICTED * (view.in_free_space + view.looked_through)
+        return mean * len(points) / CORRELATED, view
 
     def _judged(
         self, points: Tensor, found: Alignment, total: Tensor, view: View, expected: Expectation

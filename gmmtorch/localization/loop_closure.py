@@ -5,14 +5,19 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from gmmtorch.localization.local_map import Keyframe, LocalMap
+from gmmtorch.localization.alignment import chosen_rows
+from gmmtorch.localization.local_map import Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location
 from gmmtorch.localization.pose_graph import Edges, optimised
 from gmmtorch.localization.pose_search import Expectation
@@ -25,6 +30,11 @@ _REACH = 3.0  # metres between the places of a closure, and
 _DRIFT = 0.02  # metres for each metre of path between both, up to
 _FARTHEST = 10.0  # metres
 _FROM_LOST = 20.0  # metres between places of different parts, whose relative poses are a guess
+ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
+_FEWEST = 3  # scans before and after a doubtful motion, at least, and
+_TOGETHER = 6  # keyframes after a doubtful motion that are placed together
+_DETOUR = 2.0, math.radians(60)  # metres and radians of a way over a pose, more than without it
+_LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
 _NEIGHBOURS = 3  # keyframes before and after an old one, in the map of its place
 _SPACING = 3  # every third keyframe looks for closures
 _MOST_EXPLAINED = 0.8  # share of the points that a closure explains at least
@@ -34,6 +44,7 @@ _SYSTEMATIC = {  # deviations (m, rad) of errors that the points do not show, su
 }
 _ANGLE = math.radians(10)  # of the heading of a closure
 _AGREE = 0.3, math.radians(3)  # metres and radians: two closures agree
+_ELSEWHERE = 0.3, 0.3  # metres and radians: two poses are different places
 _NOTICED = 0.03, math.radians(0.3)  # metres and radians: a closure changes the poses
 
 
@@ -46,41 +57,196 @@ class _Closure(NamedTuple):
     information: Tensor
 
 
+class Doubts(NamedTuple):
+    """What may be wrong in a trajectory in 2D: rows of keyframes whose motion from the one before may be, in
+    order; rows of those whose own pose may be; and points of scans that were lost, by number.
+    """
+
+    motions: Sequence[int]
+    keyframes: Sequence[int]
+    lost: Mapping[int, Tensor]
+
+
 def closed(
     poses: Pose,
     edges: Edges,
     places: Sequence[tuple[int, Keyframe]],
     parts: Tensor,
+    doubts: Doubts,
+    max_step: float,
     least_explained: float,
     rule: WindowedRule,
-) -> tuple[Pose, Edges]:
-    """Poses near those that agree best, and the edges of a pose graph, with those of the loop closures that
-    can be found.
+) -> tuple[Pose, Edges, set[int]]:
+    """Poses near those that agree best; the edges of a pose graph, with those of the loop closures that can
+    be found; and the numbers of doubtful scans that were found revision.
 
     Args:
         poses: (N), world ← sensor. edges: of odometry.
         places: number of the pose, and keyframe, in order. parts: (K,), of the keyframes; between two parts
             the sensor was lost, and the poses of one relative to the other are a guess.
+        max_step: metres between two scans.
     """
     tried: set[tuple[int, int]] = set()
-    closures: list[_Closure] = []
+    revision = _Revision(poses, edges, places, parts, doubts.lost, max_step, least_explained, rule)
+    revision.examine(doubts.motions)
     numbers = torch.tensor([number for number, _ in places], dtype=torch.int64)
     begins = numbers[1:][parts[1:] != parts[:-1]]
     for _ in range(_ROUNDS):
-        at = poses.translation[numbers]
-        pairs = [pair for pair in _candidates(at, parts=parts) if pair not in tried]
+        poses = revision.poses
+        pairs = [pair for pair in _candidates(poses.translation[numbers], parts=parts) if pair not in tried]
         found = [
             edge
             for old, new in pairs
             if (edge := _closure(poses, places, old, new, least_explained, rule, parts))
         ]
         tried.update(pairs)
+        revision.add(found, begins)
         if not found:
             break
-        closures += found
-        edges = edges.joined(_edges(found))
-        poses = optimised(_put_together(poses, closures, begins), edges, with_covariances=False).poses
-    return poses, edges
+    found_again = revision.place(doubts) if poses.dim == 2 else set[int]()
+    return revision.poses, revision.edges, found_again
+
+
+class _Revision:
+    """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans.
+
+    A motion is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and
+    this is likelier by far than all other poses. A pose is replaced, in the same way, by that in the map of
+    the keyframes on both sides.
+    """
+
+    def __init__(
+        self,
+        poses: Pose,
+        edges: Edges,
+        places: Sequence[tuple[int, Keyframe]],
+        parts: Tensor,
+        lost: Mapping[int, Tensor],
+        max_step: float,
+        least_explained: float,
+        rule: WindowedRule,
+    ) -> None:
+        self.poses, self.edges, self.closures = poses, edges, list[_Closure]()
+        self._numbers, self._parts, self._max_step = [number for number, _ in places], parts, max_step
+        self._points = dict(lost) | {number: frame.points for number, frame in places}
+        self._least_explained, self._rule = least_explained, rule
+
+    def examine(self, doubtful: Sequence[int]) -> None:
+        """Moves the keyframes from each of these rows on to where the map of those before surely has them."""
+        groups: list[list[int]] = []
+        for first, end in itertools.pairwise([0, *doubtful, len(self._numbers)]):
+            groups.append(self._numbers[first:end])
+            while len(groups) > 1:
+                below = next((one for one in (2, 3) if self._joins(groups[-one:])), None)
+                if below is None:
+                    break
+                groups[-below:] = [groups[-below] + groups[-1]]
+
+    def add(self, closures: Sequence[_Closure], begins: Tensor) -> None:
+        """Corrects the poses by closures. begins: as for `_put_together`."""
+        if closures:
+            self.closures += closures
+            self.edges = self.edges.joined(_edges(closures))
+            poses = _put_together(self.poses, self.closures, begins)
+            self.poses = optimised(poses, self.edges, with_covariances=False).poses
+
+    def _joins(self, groups: Sequence[Sequence[int]]) -> bool:
+        """Whether the first scans of the last group surely lie in the map of the first one's last; moves
+        them."""
+        old, new = groups[0][-2 * _NEIGHBOURS - 1 :], groups[-1][:_TOGETHER]
+        if min(len(old), len(new)) < _FEWEST:
+            return False
+        reach = self._max_step * min(new[0] - old[-1], 2)
+        found = self._local(old).placed([self._frame(one) for one in new], self.poses[[old[-1]]], reach)
+        pose, before = Pose.from_matrix(found.locations[0].pose), self.poses[new[0]]
+        row = self._numbers.index(new[0])
+        is_elsewhere = _is_beyond(before.inverse() @ pose, _ELSEWHERE)
+        if found.is_sure and (is_elsewhere or self._parts[row] != self._parts[row - 1]):
+            moved = pose @ before.inverse() @ self.poses[new[0] :]
+            self.poses = Pose.cat([self.poses[: new[0]], moved])
+            self._replace(old[-1], new[0], found.locations)
+        return found.is_sure
+
+    def place(self, doubts: Doubts) -> set[int]:
+        """Places lost scans and doubtful keyframes in the map of the keyframes on both sides of each; returns
+        the numbers of those that lie there for sure.
+        """
+        numbers, found = self._numbers, set[int]()
+        if not numbers:
+            return found
+        at = self.poses[numbers]
+        detours = {row for row in range(1, len(at) - 1) if _is_detour(at[row - 1 : row + 2])}
+        doubtful = detours | set(doubts.keyframes) - {0}
+        group = joined(self._parts, self.edges, numbers)
+        for number in sorted({*doubts.lost, *(numbers[row] for row in doubtful)}):
+            row = bisect.bisect_left(numbers, number)
+            if row == 0:
+                continue
+            scan, last = self._frame(number), numbers[row - 1]
+            around = range(max(row - _NEIGHBOURS, 0), min(row + _NEIGHBOURS + 1, len(numbers)))
+            mates = [numbers[one] for one in around if group[one] == group[row - 1]]
+            near = [one for one in mates if one != number]
+            if len(near) < 2:
+                continue
+            placed = self._local(near).placed([scan], self.poses[[last]], 2 * self._max_step)
+            pose = Pose.from_matrix(placed.locations[0].pose)
+            if not placed.is_sure or not placed.locations[0].found:
+                continue
+            found.add(number)
+            if number in doubts.lost or _is_beyond(scan.pose.inverse() @ pose, _ELSEWHERE):
+                self._set(number, last, pose, information_of(placed.locations[0]))
+        return found
+
+    def _set(self, number: int, last: int, pose: Pose, information: Tensor) -> None:
+        """Replaces the pose of a scan by that relative to another one, on which all that hung on it hangs."""
+        source, target, motions, every, is_closure = self.edges
+        kept = ~(is_closure & ((source == number) | (target == number)))
+        moved = (source == number) & ~is_closure
+        source, every = torch.where(moved, last, source), every.clone()
+        before = self.poses[last].inverse()
+        motions = Pose(*chosen_rows(moved, (before @ self.poses[target]).parts, motions.parts))
+        motion = before @ pose
+        source[number - 1], every[number - 1] = last, information
+        motions.rotation[number - 1], motions.translation[number - 1] = motion.rotation, motion.translation
+        self.edges = Edges(source, target, motions, every, is_closure).at(kept.nonzero()[:, 0])
+        self.poses.rotation[number], self.poses.translation[number] = pose.rotation, pose.translation
+
+    def _replace(self, last: int, first: int, locations: Sequence[Location]) -> None:
+        """Makes the edge to a scan loose; a closure as exact as the best location takes its place."""
+        edge, source = first - 1, int(self.edges.source[first - 1])
+        motion = self.poses[source].inverse() @ self.poses[first]
+        motions, information = self.edges.motions.matrix, self.edges.information.clone()
+        motions[edge], information[edge] = motion.matrix, torch.linalg.inv(nowhere(motion.dim, *ANYWHERE))
+        self.edges = self.edges._replace(motions=Pose.from_matrix(motions), information=information)
+        sharpest = min(locations, key=lambda one: float(one.covariance.trace()))
+        location = replace(sharpest, pose=self.poses[first].matrix)
+        motion = self.poses[last].inverse() @ self.poses[first]
+        self.add([_Closure(last, first, motion, information_of(location))], torch.zeros(0).long())
+
+    def _frame(self, number: int) -> Keyframe:
+        return Keyframe(self._points[number], self.poses[number])
+
+    def _local(self, numbers: Sequence[int]) -> LocalMap:
+        return LocalMap([self._frame(one) for one in numbers], self._least_explained, self._rule)
+
+
+def _is_detour(poses: Pose) -> bool:
+    """Whether the second of three poses is far from the way of the others."""
+    before, after, across = (poses[one].inverse() @ poses[other] for one, other in ((0, 1), (1, 2), (0, 2)))
+    far = before.translation.norm() + after.translation.norm() - across.translation.norm()
+    return bool(far > _DETOUR[0]) or bool(before.angle() + after.angle() - across.angle() > _DETOUR[1])
+
+
+def joined(parts: Tensor, edges: Edges, numbers: Sequence[int]) -> Tensor:
+    """The group (K,) of each keyframe: closures join its part (K,), counted from 1, directly or not."""
+    rows = torch.tensor(numbers)
+    closures = edges.at(edges.is_closure.nonzero()[:, 0])
+    both = closures.source, closures.target
+    ends = [parts[torch.searchsorted(rows, end, right=True) - 1] - 1 for end in both]
+    n = int(parts.max())
+    counts = torch.zeros(n, n).index_put_(tuple(ends), torch.ones(1), accumulate=True)
+    _, group = connected_components((counts + counts.T >= _LEAST_CLOSURES).numpy(), directed=False)
+    return torch.from_numpy(group)[parts - 1]
 
 
 def _put_together(poses: Pose, closures: Sequence[_Closure], begins: Tensor) -> Pose:

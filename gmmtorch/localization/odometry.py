@@ -9,8 +9,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gmmtorch.arrays import ArrayLike, as_tensor
@@ -18,7 +16,7 @@ from gmmtorch.datasets import POINT_TIMES, Dataset, Reposed, deskewed, with_pose
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.localization.local_map import LOST, Keyframe, LocalMap, nowhere
 from gmmtorch.localization.location import Location, continued, measured_motion
-from gmmtorch.localization.loop_closure import LoopCloser, closed, information_of
+from gmmtorch.localization.loop_closure import ANYWHERE, Doubts, LoopCloser, closed, information_of, joined
 from gmmtorch.localization.pose_graph import Edges, optimised
 from gmmtorch.localization.pose_search import Expectation
 from gmmtorch.mapping import WindowedRule
@@ -33,8 +31,8 @@ _KEYFRAMES = 10  # in the local map,
 _MANY_KEYFRAMES = 80  # or of a sensor that looks in one direction
 _NARROW = 0.8  # length of the mean direction of its points; 0.64 for a half circle, 0.9 for a cone of 70°
 _GIVEN_UP = 3  # lost scans in a row, after which the next one begins a new local map
-_ANYWHERE = 100.0, math.pi  # deviations (m, rad) of a map that begins, from the one before
-_LEAST_CLOSURES = 2  # that join two maps: one alone may be wrong
+_DOUBTED = 0.5  # probability of a pose, below which several scans are searched for together
+_WEAK = 0.95  # probability of a pose, below which the scan is searched for again between its neighbours
 _APART = "the sensor was lost before, and no place that it saw later is known from before"
 _LONGEST_GAP = 2  # steps that a sensor may have moved since the last pose that was found, at most
 _FEWEST = 10  # returns of a scan that can be located
@@ -77,7 +75,8 @@ class Odometry:
     pose, from a wider lattice and from other headings. `trajectory` finds the places that were seen twice and
     corrects all poses by a pose graph (`localization.pose_graph`). A scan that is not found never enters the
     local map. If the next one is found, it is searched for again. The fourth in a row begins a new map, whose
-    poses are found if two closures that agree join it with the first.
+    poses are found if two closures that agree join it with the first. In 2D `trajectory` estimates doubtful
+    motions and the poses of lost scans again, from several scans before and after them.
 
     Args:
         n_keyframes: in the local map. None: 10, or 80 for a sensor with a narrow field of view, such as a
@@ -119,6 +118,8 @@ class Odometry:
         self._frames: list[int] = []  # scans that are keyframes
         self._last_frame = self._last_found = 0
         self._lost: list[Keyframe] = []  # the last scans, if they were not found
+        self._doubtful: list[int] = []  # keyframes whose motion from the one before may be wrong
+        self._unplaced: dict[int, Tensor] = {}  # points of lost scans
         self._parts: list[int] = []  # keyframes that begin a map of their own, because the sensor was lost
         self._edges: list[tuple[int, Pose, Tensor]] = []  # from which scan, motion, information
         self._motion: Pose | None = None
@@ -224,11 +225,14 @@ class Odometry:
         if loops:
             places = list(zip(self._frames, self.keyframes, strict=True))
             parts = torch.bucketize(torch.arange(len(places)), torch.tensor(self._parts), right=True)
-            poses, edges = closed(poses, edges, places, parts, self.least_explained, self.rule)
+            limits = self.max_step, self.least_explained, self.rule
+            poses, edges, again = closed(poses, edges, places, parts, self._doubts(), *limits)
+            found[sorted(again)] = True
         best = optimised(poses, edges)
         used = edges.is_closure & (best.weights > 0.5)
-        doubts = tuple("; ".join(location.doubts) for location in self._locations)
-        is_apart = self._is_apart(edges.at(used))
+        doubts = tuple("" if good else "; ".join(location.doubts)
+                       for good, location in zip(found.tolist(), self._locations, strict=True))  # fmt: skip
+        is_apart = self._is_apart(edges.at(used.nonzero()[:, 0]))
         doubts = tuple(f"{doubt}; {_APART}" if apart and doubt else _APART if apart else doubt
                        for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
         best = best._replace(poses=_bridged(best.poses, found))
@@ -326,15 +330,20 @@ class Odometry:
             self._lost = []
         else:
             lost.append(scan)
+            if pose.dim == 2 and len(scan.points) >= _FEWEST:
+                self._unplaced[number] = scan.points
         begins = self._local is None or len(self._lost) > _GIVEN_UP
         is_new = begins or (location.found and self._is_new(pose))
         if is_new and len(scan.points) >= _FEWEST:
             if begins:
                 if self._edges:  # a closure decides where the new map is, not the guess
-                    anywhere = replace(location, covariance=nowhere(pose.dim, *_ANYWHERE))
+                    anywhere = replace(location, covariance=nowhere(pose.dim, *ANYWHERE))
                     self._edges[-1] = (*self._edges[-1][:2], information_of(anywhere))
                 self._parts.append(len(self.keyframes))
                 self._lost, self._last_found = [], number
+            is_sure = location.found and location.probability >= _DOUBTED and not lost
+            if self.keyframes and not is_sure:
+                self._doubtful.append(len(self.keyframes))
             self._last_frame = number
             self._frames.append(number)
             self.keyframes.append(scan._replace(pose=pose))
@@ -375,13 +384,20 @@ class Odometry:
 
     def _is_apart(self, closures: Edges) -> Tensor:
         """Whether the map of each scan (N,) is not joined with the first one by closures, directly or not."""
-        begins = torch.tensor([self._frames[row] for row in self._parts[1:]], dtype=torch.int64)
-        n, part = len(begins) + 1, torch.bucketize(torch.arange(len(self._poses)), begins, right=True)
-        ends = part[closures.source].numpy(), part[closures.target].numpy()
-        links = coo_matrix((torch.ones(len(closures.source)).numpy(), ends), shape=(n, n)).tocsr()
-        links = links + links.T >= _LEAST_CLOSURES
-        _, group = connected_components(links, directed=False)
-        return torch.from_numpy(group != group[0])[part]
+        if not self._frames:
+            return torch.zeros(len(self._poses)).bool()
+        rows = torch.tensor(self._frames)
+        parts = torch.bucketize(torch.arange(len(rows)), torch.tensor(self._parts), right=True)
+        group = joined(parts, closures, self._frames)
+        last = torch.searchsorted(rows, torch.arange(len(self._poses)), right=True) - 1
+        return (group != group[0])[last.clamp_min(0)]
+
+    def _doubts(self) -> Doubts:
+        if self._poses[0].dim == 3:
+            return Doubts([], [], {})
+        weak = [row for row, number in enumerate(self._frames)
+                if self._locations[number].probability < _WEAK]  # fmt: skip
+        return Doubts(self._doubtful, weak, self._unplaced)
 
     def _all_edges(self) -> Edges:
         target = torch.arange(1, len(self._poses))

@@ -13,9 +13,8 @@ from scipy.optimize import least_squares
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.localization import Odometry, loop_closure
-from gmmtorch.localization.local_map import nowhere
-from gmmtorch.localization.loop_closure import _Closure, _edges, _put_together
-from gmmtorch.localization.odometry import _ANYWHERE
+from gmmtorch.localization.local_map import Keyframe, nowhere
+from gmmtorch.localization.loop_closure import ANYWHERE, Doubts, _Closure, _edges, _put_together, _Revision
 from gmmtorch.localization.pose_graph import Edges, _moved, _normal_equations, optimised, residuals
 from gmmtorch.pose import Pose
 
@@ -219,7 +218,7 @@ def test_two_closures_that_agree_move_a_map_that_began_after_the_sensor_was_lost
     source, target = torch.arange(7), torch.arange(1, 8)
     sure = torch.linalg.inv(nowhere(2, 0.02, 0.005))
     information = sure.repeat(7, 1, 1)
-    information[3] = torch.linalg.inv(nowhere(2, *_ANYWHERE))
+    information[3] = torch.linalg.inv(nowhere(2, *ANYWHERE))
     edges = Edges(source, target, guess[source].inverse() @ guess[target], information, source < 0)
     found = [
         _Closure(one, other, true[one].inverse() @ true[other], sure)
@@ -236,3 +235,65 @@ def test_two_closures_that_agree_move_a_map_that_began_after_the_sensor_was_lost
     assert odometry._is_apart(edges.at(used)).tolist() == [False] * 4 + [not is_joined] * 4
     if is_joined:
         assert float((best.poses.translation - true.translation).norm(dim=1).max()) < 0.01
+
+
+# -- doubtful motions and poses ------------------------------------------------------------------------
+
+
+WRONG = Pose.from_yaw(2.5, torch.tensor([3.0, -2.0]).double())
+
+
+def revision_of(
+    poses: Pose, scans: list[torch.Tensor], lost: dict[int, torch.Tensor] | None = None
+) -> _Revision:
+    """Scans that are keyframes unless they are lost, at poses whose motions the edges repeat."""
+    source = torch.arange(len(scans) - 1)
+    sure = torch.linalg.inv(nowhere(2, 0.02, 0.005)).repeat(len(source), 1, 1)
+    edges = Edges(source, source + 1, poses[:-1].inverse() @ poses[1:], sure, source < 0)
+    order = torch.randperm(len(scans[0]), generator=torch.Generator().manual_seed(0))
+    places = [(i, Keyframe(scan[order], poses[i])) for i, scan in enumerate(scans) if i not in (lost or {})]
+    parts = torch.ones(len(places), dtype=torch.int64)
+    return _Revision(poses, edges, places, parts, lost or {}, 8.0, 0.5, Odometry().rule)
+
+
+def errors(revision: _Revision, true: Pose) -> torch.Tensor:
+    poses = optimised(revision.poses, revision.edges, with_covariances=False).poses
+    return (true.inverse() @ poses).matrix.sub(torch.eye(3)).abs().amax((1, 2))
+
+
+@pytest.fixture(scope="module")
+def lap_of_20() -> tuple[list[torch.Tensor], Pose]:
+    messages, true = lap(20)
+    return [points(message) for message in messages], Pose.from_matrix(true)
+
+
+def test_a_wrong_motion_is_found_by_several_scans_together(lap_of_20):
+    scans, true = lap_of_20
+    wrong = Pose.cat([true[:12], true[11] @ WRONG @ true[11].inverse() @ true[12:]])
+    revision = revision_of(wrong, scans)
+    assert float(errors(revision, true).max()) > 1
+    revision.examine([12])
+    assert float(errors(revision, true).max()) < 0.05
+    right = revision_of(true, scans)
+    right.examine([12])
+    assert not right.closures  # a right motion stays as it is
+
+
+def test_a_motion_along_a_corridor_without_ends_is_not_replaced():
+    along = torch.linspace(-30, 30, 400).double()
+    scan = torch.stack([along, torch.where(torch.arange(400) % 2 == 0, 1.0, -1.0).double()], 1)
+    at = Pose.from_yaw(
+        torch.zeros(10).double(), torch.arange(10).double()[:, None] * torch.tensor([1.0, 0.0])
+    )
+    revision = revision_of(at, [scan] * 10)
+    revision.examine([5])
+    assert not revision.closures
+    assert torch.equal(revision.poses.matrix, at.matrix)
+
+
+def test_a_lost_scan_and_a_wrong_pose_are_found_between_their_neighbours(lap_of_20):
+    scans, true = lap_of_20
+    shifted = [true[i] @ WRONG if i in (6, 13) else true[i] for i in range(20)]
+    revision = revision_of(Pose.stack(shifted), scans, {6: scans[6]})
+    assert revision.place(Doubts([], [12], {6: scans[6]})) == {6, 13}
+    assert float(errors(revision, true).max()) < 0.05
