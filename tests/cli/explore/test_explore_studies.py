@@ -63,7 +63,13 @@ def test_a_study_of_planners_compares_them(run):
 def test_a_study_of_networks_compares_them_with_the_lossless_one(run):
     cut = "partitions:[{begin:1,end:3,groups:[[0],[1]]}]"
     variants = f"study.variants=[{{}},{{loss:0.5}},{{{cut}}},{{team:grid_shared}}]"
-    options = ["experiment=fig4_5_bandwidth", "study.seeds=[0]", variants, "evaluation.codecs=[]", "network.announce=2"]
+    options = [
+        "experiment=fig4_5_bandwidth",
+        "study.seeds=[0]",
+        variants,
+        "evaluation.codecs=[]",
+        "network.announce=2",
+    ]
     done = succeeded(run(*options, "report.figures=true", "duration=5", "evaluation.every=1"))
     pictures = {name for name in done.files() if name.endswith(".png")}
     assert pictures == {"loss.png", "entropy.png", "bandwidth.png", "summary.png"}
