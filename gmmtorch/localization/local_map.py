@@ -199,23 +199,11 @@ class LocalMap:
         """Where some scans in 2D, whose poses agree with each other, most likely lie together, by the sum of
         their evidence: at their poses, or with the first one up to `reach` metres from a pose `near` (1).
         """
-        first = scans[0].pose
-        ways = [first.inverse() @ scan.pose for scan in scans]
+        ways = [scans[0].pose.inverse() @ scan.pose for scan in scans]
         some = [scan.points[:_COARSE_POINTS] for scan in scans]
         cloud = torch.cat([way.apply(points) for way, points in zip(ways, some, strict=True)])
         cloud = cloud[torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))]
-        starts = [first[None]]
-        for way, scan in zip(ways, scans, strict=True):
-            around = Expectation(near @ way, math.inf, math.inf, 1.0, reach)
-            starts.append(self._search.best(scan.points, around, _STARTS)[0] @ way.inverse())
-        firsts = Pose.cat(starts)
-        rough = torch.zeros(len(firsts)).double()
-        for way, points in zip(ways, some, strict=True):
-            score = self._targets[0].scores(points[:_RANKED], (firsts @ way).shifted(-self._center))
-            rough += score / CORRELATED + self._seen(points[:_RANKED], firsts @ way)[0]
-        rough[0] = math.inf
-        order = rough.argsort(descending=True, stable=True)
-        firsts = firsts[order[distinct(firsts[order], _APART, _APART / 2)][:_STARTS]]
+        firsts = self._starts_together(scans, ways, near, reach)
         for target in self._targets[:2]:
             climbed = align(cloud[: 2 * _COARSE_POINTS], target, firsts.shifted(-self._center), _STEPS)
             firsts = climbed.motions.orthonormal().shifted(self._center)
@@ -238,6 +226,25 @@ class LocalMap:
             doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
             locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
         return Placement(locations, lead > _LEAD and float(total[best]) > _SURE + tries)
+
+    def _starts_together(
+        self, scans: Sequence[Keyframe], ways: Sequence[Pose], near: Pose, reach: float
+    ) -> Pose:
+        """Starts for the first of some scans: its own pose, then those that the search of each scan finds,
+        the likeliest for all scans first. ways: from the first scan to each."""
+        starts = [scans[0].pose[None]]
+        for way, scan in zip(ways, scans, strict=True):
+            around = Expectation(near @ way, math.inf, math.inf, 1.0, reach)
+            starts.append(self._search.best(scan.points, around, _STARTS)[0] @ way.inverse())
+        firsts = Pose.cat(starts)
+        rough = torch.zeros(len(firsts)).double()
+        for way, scan in zip(ways, scans, strict=True):
+            points, poses = scan.points[:_RANKED], firsts @ way
+            score = self._targets[0].scores(points, poses.shifted(-self._center))
+            rough += score / CORRELATED + self._seen(points, poses)[0]
+        rough[0] = math.inf  # so that its own pose is always tried
+        order = rough.argsort(descending=True, stable=True)
+        return firsts[order[distinct(firsts[order], _APART, _APART / 2)][:_STARTS]]
 
     def _lattice(
         self,

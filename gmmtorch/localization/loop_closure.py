@@ -78,7 +78,7 @@ def closed(
     rule: WindowedRule,
 ) -> tuple[Pose, Edges, set[int]]:
     """Poses near those that agree best; the edges of a pose graph, with those of the loop closures that can
-    be found; and the numbers of doubtful scans that were found revision.
+    be found; and the numbers of doubtful scans that were found again.
 
     Args:
         poses: (N), world ← sensor. edges: of odometry.
@@ -137,7 +137,7 @@ class _Revision:
         for first, end in itertools.pairwise([0, *doubtful, len(self._numbers)]):
             groups.append(self._numbers[first:end])
             while len(groups) > 1:
-                below = next((one for one in (2, 3) if self._joins(groups[-one:])), None)
+                below = next((one for one in (2, 3) if self._join(groups[-one:])), None)
                 if below is None:
                     break
                 groups[-below:] = [groups[-below] + groups[-1]]
@@ -150,9 +150,9 @@ class _Revision:
             poses = _put_together(self.poses, self.closures, begins)
             self.poses = optimised(poses, self.edges, with_covariances=False).poses
 
-    def _joins(self, groups: Sequence[Sequence[int]]) -> bool:
-        """Whether the first scans of the last group surely lie in the map of the first one's last; moves
-        them."""
+    def _join(self, groups: Sequence[Sequence[int]]) -> bool:
+        """Moves the last group to where its first scans lie in the map of the first group's last ones, if
+        that is sure; returns whether it is."""
         old, new = groups[0][-2 * _NEIGHBOURS - 1 :], groups[-1][:_TOGETHER]
         if min(len(old), len(new)) < _FEWEST:
             return False
@@ -208,7 +208,7 @@ class _Revision:
         motion = before @ pose
         source[number - 1], every[number - 1] = last, information
         motions.rotation[number - 1], motions.translation[number - 1] = motion.rotation, motion.translation
-        self.edges = Edges(source, target, motions, every, is_closure).at(kept.nonzero()[:, 0])
+        self.edges = Edges(source, target, motions, every, is_closure).at(kept)
         self.poses.rotation[number], self.poses.translation[number] = pose.rotation, pose.translation
 
     def _replace(self, last: int, first: int, locations: Sequence[Location]) -> None:
@@ -240,7 +240,7 @@ def _is_detour(poses: Pose) -> bool:
 def joined(parts: Tensor, edges: Edges, numbers: Sequence[int]) -> Tensor:
     """The group (K,) of each keyframe: closures join its part (K,), counted from 1, directly or not."""
     rows = torch.tensor(numbers)
-    closures = edges.at(edges.is_closure.nonzero()[:, 0])
+    closures = edges.at(edges.is_closure)
     both = closures.source, closures.target
     ends = [parts[torch.searchsorted(rows, end, right=True) - 1] - 1 for end in both]
     n = int(parts.max())

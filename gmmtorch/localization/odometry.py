@@ -224,7 +224,7 @@ class Odometry:
         found = torch.tensor([location.found for location in self._locations])
         if loops:
             places = list(zip(self._frames, self.keyframes, strict=True))
-            parts = torch.bucketize(torch.arange(len(places)), torch.tensor(self._parts), right=True)
+            parts = self._parts_of_keyframes()
             limits = self.max_step, self.least_explained, self.rule
             poses, edges, again = closed(poses, edges, places, parts, self._doubts(), *limits)
             found[sorted(again)] = True
@@ -232,7 +232,7 @@ class Odometry:
         used = edges.is_closure & (best.weights > 0.5)
         doubts = tuple("" if good else "; ".join(location.doubts)
                        for good, location in zip(found.tolist(), self._locations, strict=True))  # fmt: skip
-        is_apart = self._is_apart(edges.at(used.nonzero()[:, 0]))
+        is_apart = self._is_apart(edges.at(used))
         doubts = tuple(f"{doubt}; {_APART}" if apart and doubt else _APART if apart else doubt
                        for doubt, apart in zip(doubts, is_apart.tolist(), strict=True))  # fmt: skip
         best = best._replace(poses=_bridged(best.poses, found))
@@ -387,10 +387,13 @@ class Odometry:
         if not self._frames:
             return torch.zeros(len(self._poses)).bool()
         rows = torch.tensor(self._frames)
-        parts = torch.bucketize(torch.arange(len(rows)), torch.tensor(self._parts), right=True)
-        group = joined(parts, closures, self._frames)
+        group = joined(self._parts_of_keyframes(), closures, self._frames)
         last = torch.searchsorted(rows, torch.arange(len(self._poses)), right=True) - 1
         return (group != group[0])[last.clamp_min(0)]
+
+    def _parts_of_keyframes(self) -> Tensor:
+        """The number (K,), from 1, of the map that each keyframe belongs to."""
+        return torch.bucketize(torch.arange(len(self._frames)), torch.tensor(self._parts), right=True)
 
     def _doubts(self) -> Doubts:
         if self._poses[0].dim == 3:

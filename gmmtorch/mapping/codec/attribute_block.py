@@ -217,7 +217,7 @@ def _share_steps(share: Tensor) -> Tensor:
 
 
 def _log(variance: Tensor) -> Tensor:
-    """Deviations as whole powers of √2."""
+    """Deviations, of which the variance is given, as whole powers of √2."""
     return variance.clamp_min(1e-60).log2().round().long()
 
 

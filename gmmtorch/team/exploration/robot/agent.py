@@ -248,8 +248,8 @@ class Agent:
         self.heard_at: dict[int, float] = {}
         self._places: dict[int, tuple[float, Tensor]] = {}  # where teammates were, (N, 3), and when
         self._newest: dict[int, int] = {}  # sequence of the newest component of each teammate
-        self._told_at = -math.inf  # when it was where it last said that it is
-        self._sensed_at = self._learned_at = -math.inf  # its last frame, and the last with components
+        self._told_at = -math.inf  # time of the newest plan, or frame with components, that it sent
+        self._sensed_at = self._learned_at = -math.inf  # times of the last frame, and of the last with news
         self.refused: Counter[str] = Counter()
         self._evaluator, self._primitives = evaluator, primitives
         self._waiting = Waiting(primitives, _PATIENCE)
@@ -260,8 +260,8 @@ class Agent:
         self._rests = False
         self._seen_from: tuple[Tensor, tuple[Tensor, Tensor]] | None = None  # the last pose, and its beams
         self._plan: Plan | None = None
-        self._views_at = self._map_at = -math.inf  # when views were sent last, and records asked for
-        self._held_at = -math.inf  # since when few records wait for more
+        self._views_at = self._map_at = -math.inf  # when views, and the map, were due last
+        self._held_at = -math.inf  # since when few records wait for more to come
         self._sent_pose: Tensor | None = None  # where it rests, according to the last plan sent
         self._n_unsent = 0  # plans at that pose since
 

@@ -112,7 +112,7 @@ class Backlog:
 
 _OF_CHANNELS = Intervals.span(CHANNELS, CHANNELS + END)
 ABOUT_A_DATAGRAM = 160  # components
-FEW = 32  # components, of 4 bytes each, of a datagram that has 20 bytes more, and 28 of UDP and IPv4
+FEW = 32  # components: 128 bytes of a datagram, to which 20 are added, and 28 of UDP and IPv4
 _RUN = 32  # components with consecutive keys whose information is compared
 
 
