@@ -8,7 +8,7 @@ import math
 import re
 import zlib
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -103,20 +103,23 @@ NO_POSE = "no pose at the time of the scan"
 class Dataset(Sequence[Scan]):
     """Scans in the order of their recording.
 
-    Subclasses implement `_count` and `_read`. If the source has poses (N, D+1, D+1), world ← sensor, or
-    times (N,) in seconds, float64, they set `_poses` or `_times`, or implement `_known_pose` or
-    `_known_times`.
+    Subclasses implement `_read`, and set `_files`, one for each scan, or implement `_count`. If the source
+    has poses (N, D+1, D+1), world ← sensor, or times (N,) in seconds, float64, they set `_poses` or `_times`,
+    or implement `_known_pose` or `_known_times`.
 
     Attributes:
         name: of the data set.
         ranges: how readings are interpreted.
         stride: every n-th scan of the source is read.
+        attributes: channels of the points that are read, if a scan has them.
         n_sensors: that the scans are of.
         keeps_point_times: scans that are not deskewed have the channel `POINT_TIMES`, if the source has it.
     """
 
+    attributes: tuple[str, ...] = ()
     n_sensors = 1
     keeps_point_times = False
+    _files: Sequence[Path]
     _poses: Tensor | None = None
     _times: Tensor | None = None
 
@@ -128,9 +131,9 @@ class Dataset(Sequence[Scan]):
         self.stride = stride
         self._skipped: dict[str, set[int]] = {}
 
-    @abstractmethod
     def _count(self) -> int:
         """Number of scans in the source."""
+        return len(self._files)
 
     @abstractmethod
     def _read(self, index: int) -> Scan:
@@ -193,9 +196,9 @@ class Dataset(Sequence[Scan]):
         """
         return {reason: len(scans) for reason, scans in self._skipped.items()}
 
-    def _without(self, channels: Iterable[str], index: int) -> None:
-        """Counts a scan that lacks some of the channels that it should have."""
-        for name in channels:
+    def _note_missing(self, channels: Collection[str], index: int) -> None:
+        """Counts a scan with only these of the `attributes`."""
+        for name in set(self.attributes).difference(channels):
             self._skip(f"read without {name}, which they lack", index)
 
     def can_continue(self, n_read: int) -> bool:
@@ -229,7 +232,7 @@ class Dataset(Sequence[Scan]):
         return position * self.stride
 
     def __iter__(self) -> Iterator[Scan]:
-        return (self[i] for i in range(len(self)))
+        return map(self.__getitem__, range(len(self)))
 
 
 def require_path(path: str | Path, kind: str, content: str, source: str) -> Path:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, make_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
-from gmmtorch.declarations import option, repeated
+from gmmtorch.declarations import default_of, option, repeated
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 
 _REQUIRED = "???"
@@ -17,7 +17,7 @@ SUFFIXES = (".npy", ".las", ".laz", ".pcd", ".ply")
 
 @dataclass(kw_only=True)
 class DatasetOptions:
-    """What all data sets have."""
+    """Every option of a data set. `OPTIONS` tells which data set has which, with which default."""
 
     name: str = option(_REQUIRED, "name of the data set")
     max_range: float | None = option(
@@ -37,87 +37,31 @@ class DatasetOptions:
         "prediction of odometry=mixture. constant: the motion continues; dataset: as between the poses of "
         "the data set, such as those of wheels; imu: by the IMU of a ROS bag",
     )
-
-
-@dataclass(kw_only=True)
-class FileOptions(DatasetOptions):
-    """A data set in files."""
-
     path: str = option(_REQUIRED, "file or folder")
     poses: str | None = option(
         None,
         "trajectory file (TUM or KITTI) whose poses replace those of the data set. rosbag: tf, standing, a "
         "topic of poses, or such a file; null: tf",
     )
-
-
-@dataclass(kw_only=True)
-class ChannelOptions(FileOptions):
-    """A data set whose points can have channels."""
-
     attributes: list[str] = option(
         [], "channels that the map learns beside the points, such as [colour,intensity,class]"
     )
-
-
-@dataclass(kw_only=True)
-class CarmenOptions(FileOptions):
-    """A CARMEN log."""
-
-    max_range: float | None = repeated(DatasetOptions, "max_range", 50.0)
-    no_return_range: float = repeated(DatasetOptions, "no_return_range", 8.0)
-
-
-@dataclass(kw_only=True)
-class DepthFramesOptions(ChannelOptions):
-    """Depth images."""
-
     pixel_stride: int = option(1, "every n-th pixel of every n-th row of depth images")
     depth_scale: float | None = option(
-        0.001,
-        "metres per unit of depth images; null: 0.001 for whole numbers, 1 for floating ones",
+        0.001, "metres per unit of depth images; null: 0.001 for whole numbers, 1 for floating ones"
     )
     up: str = option(
         "z",
         "axis of the poses' world frame that points up: x, -x, y, -y, z or -z; it becomes z. -y if the world "
         "frame is that of the first camera, as in 7-Scenes",
     )
-
-
-@dataclass(kw_only=True)
-class TumOptions(ChannelOptions):
-    """A sequence of the TUM RGB-D benchmark."""
-
-    pixel_stride: int = repeated(DepthFramesOptions, "pixel_stride", 1)
-    depth_scale: float | None = repeated(DepthFramesOptions, "depth_scale", 0.0002)
     intrinsics: list[float] | None = option(
         None,
         "[fx,fy,cx,cy] in pixels of depth images without distortion; null: the recording's own, for tum "
         "[525,525,319.5,239.5]",
     )
-    max_gap: float = option(0.5, "longest time (s) between two poses that are interpolated")
-
-
-@dataclass(kw_only=True)
-class KittiOptions(ChannelOptions):
-    """A sequence of the KITTI benchmark."""
-
-    max_gap: float = repeated(TumOptions, "max_gap", 2.0)
-
-
-@dataclass(kw_only=True)
-class NuScenesOptions(ChannelOptions):
-    """A scene of nuScenes."""
-
+    max_gap: float = option(2.0, "longest time (s) between two poses that are interpolated")
     scene: str | None = option(None, "name of the scene, such as scene-0061; null: the only one")
-
-
-@dataclass(kw_only=True)
-class RosbagOptions(TumOptions):
-    """A ROS bag, or a network capture of a lidar."""
-
-    max_gap: float = repeated(TumOptions, "max_gap", 2.0)
-    depth_scale: float | None = repeated(DepthFramesOptions, "depth_scale", None)
     topic: Any = option(
         None,
         "topic of the sensor, or topics of several, such as [/front,/rear]; null: the only one of its kind",
@@ -127,8 +71,7 @@ class RosbagOptions(TumOptions):
     )
     sensor_frame: str | None = option(None, "read only messages of this frame; null: all")
     extrinsic: list[float] | None = option(
-        None,
-        "[x,y,z,qx,qy,qz,qw] (m) of the sensor on the body with the poses; null: from /tf_static",
+        None, "[x,y,z,qx,qy,qz,qw] (m) of the sensor on the body with the poses; null: from /tf_static"
     )
     clock: str = option("header", "header: stamps of the messages; received: times of recording")
     deskew: bool = option(True, "each point with a time gets the pose of its own time")
@@ -137,59 +80,44 @@ class RosbagOptions(TumOptions):
         "file of the lidar whose packets are read: metadata (.json) of an Ouster, corrections (.csv) of a "
         "Hesai; null: the metadata in the recording or beside it, nominal angles",
     )
-
-
-@dataclass(kw_only=True)
-class MeshOptions(FileOptions):
-    """Points of a mesh."""
-
     n_points: int = option(100_000, "number of points sampled from the surface of the mesh")
+    n_scans: int | None = option(None, "number of simulated scans; null: the whole tour")
+    sensor: str = option("lidar", "lidar or depth_camera")
     seed: int = option(0, "seed of the simulation, its points or its noise")
 
 
-@dataclass(kw_only=True)
-class SyntheticOptions(DatasetOptions):
-    """A simulated building."""
-
-    no_return_range: float = repeated(DatasetOptions, "no_return_range", 8.0)
-    seed: int = repeated(MeshOptions, "seed", 0)
-    n_scans: int | None = option(None, "number of simulated scans; null: the whole tour")
+_OF_ALL = ("name", "max_range", "no_return_range", "stride", "odometry", "motion")
+_OF_FILES = ("path", "poses")
+_OF_CLOUDS = (*_OF_FILES, "attributes")
+_OF_TUM = (*_OF_CLOUDS, "pixel_stride", "depth_scale", "intrinsics", "max_gap")
+_OF_BAGS = ("topic", "frame", "sensor_frame", "extrinsic", "clock", "deskew", "calibration")
 
 
-@dataclass(kw_only=True)
-class SyntheticBuildingOptions(SyntheticOptions):
-    """A simulated building in 3D."""
-
-    sensor: str = option("lidar", "lidar or depth_camera")
-
-
-@dataclass(kw_only=True)
-class MeshScansOptions(FileOptions):
-    """Simulated scans of a mesh, about 2 m apart."""
-
-    no_return_range: float = repeated(DatasetOptions, "no_return_range", 8.0)
-    n_scans: int = repeated(SyntheticOptions, "n_scans", 100)
-    sensor: str = repeated(SyntheticBuildingOptions, "sensor", "lidar")
-    seed: int = repeated(MeshOptions, "seed", 0)
+def _options(*names: str, **defaults: Any) -> type:
+    """A dataclass with the options of all data sets and these, some with other defaults."""
+    known, types = {item.name: item for item in fields(DatasetOptions)}, get_type_hints(DatasetOptions)
+    values = {name: defaults.get(name, default_of(known[name])) for name in (*_OF_ALL, *names)}
+    made = [(name, types[name], repeated(DatasetOptions, name, value)) for name, value in values.items()]
+    return make_dataclass("Options", made)
 
 
-OPTIONS: dict[str, type[DatasetOptions]] = {
-    "carmen": CarmenOptions,
-    "scan_folder": ChannelOptions,
-    "pcd_viewpoint": ChannelOptions,
-    "depth_frames": DepthFramesOptions,
-    "e57": FileOptions,
-    "octomap_log": FileOptions,
-    "rosbag": RosbagOptions,
-    "kitti": KittiOptions,
-    "nuscenes": NuScenesOptions,
-    "tum": TumOptions,
-    "mesh": MeshOptions,
-    "mesh_scans": MeshScansOptions,
-    "synthetic_building": SyntheticBuildingOptions,
-    "synthetic_building_2d": SyntheticOptions,
+OPTIONS: dict[str, type] = {
+    "carmen": _options(*_OF_FILES, max_range=50.0, no_return_range=8.0),
+    "scan_folder": _options(*_OF_CLOUDS),
+    "pcd_viewpoint": _options(*_OF_CLOUDS),
+    "depth_frames": _options(*_OF_CLOUDS, "pixel_stride", "depth_scale", "up"),
+    "e57": _options(*_OF_FILES),
+    "octomap_log": _options(*_OF_FILES),
+    "rosbag": _options(*_OF_TUM, *_OF_BAGS, depth_scale=None),
+    "kitti": _options(*_OF_CLOUDS, "max_gap"),
+    "nuscenes": _options(*_OF_CLOUDS, "scene"),
+    "tum": _options(*_OF_TUM, depth_scale=0.0002, max_gap=0.5),
+    "mesh": _options(*_OF_FILES, "n_points", "seed"),
+    "mesh_scans": _options(*_OF_FILES, "n_scans", "sensor", "seed", no_return_range=8.0, n_scans=100),
+    "synthetic_building": _options("seed", "n_scans", "sensor", no_return_range=8.0),
+    "synthetic_building_2d": _options("seed", "n_scans", no_return_range=8.0),
 }
-"""The options of each data set."""
+"""A dataclass with the options of each data set."""
 
 
 def point_path(path: str | Path) -> Path:

@@ -23,12 +23,7 @@ from torch import Tensor
 
 from gmmtorch.datasets.base import NO_POSE, Dataset, Ranges, check_poses, natural_key, require_path
 from gmmtorch.datasets.point_files.channels import check_channels
-from gmmtorch.datasets.trajectory import (
-    NANOSECONDS,
-    order_of_rows,
-    read_trajectory,
-    to_nanoseconds,
-)
+from gmmtorch.datasets.trajectory import NANOSECONDS, order_of_rows, read_trajectory, to_nanoseconds
 from gmmtorch.errors import DataError, InvalidArgumentError, check_choice, check_number, check_whole
 from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhole_matrix
 from gmmtorch.pose import Pose
@@ -104,7 +99,7 @@ class ColourCamera(NamedTuple):
 
 
 class _DepthDataset(Dataset):
-    """Depth images in files, whose points have colours if `attributes` names them.
+    """Depth images in files, whose points have colours if `attributes` is ["colour"].
 
     pixel_stride: every n-th pixel of every n-th row is used. depth_scale: metres per unit of the images.
     intrinsics: the pinhole matrix (3, 3) in pixels.
@@ -112,7 +107,6 @@ class _DepthDataset(Dataset):
 
     intrinsics: Tensor
     _camera: ColourCamera
-    _files: list[Path]
 
     def __init__(
         self,
@@ -132,19 +126,14 @@ class _DepthDataset(Dataset):
     def _colour_file(self, index: int) -> Path | None:
         """The colour image of a depth image; None without one."""
 
-    def _count(self) -> int:
-        return len(self._files)
-
     def _read(self, index: int) -> Scan:
         depth, pose = self._depth(index), self._known_pose(index)
         assert pose is not None
         points, channels = back_project(depth, self.intrinsics, self.pixel_stride), {}
-        if self.attributes:
-            path = self._colour_file(index)
-            if path is None:
-                self._without(self.attributes, index)
-            else:
-                channels[COLOUR] = self._camera.colours(points, path, (depth.shape[0], depth.shape[1]))
+        path = self._colour_file(index) if self.attributes else None
+        if path is not None:
+            channels[COLOUR] = self._camera.colours(points, path, (depth.shape[0], depth.shape[1]))
+        self._note_missing(channels, index)
         return self.ranges.posed(points, pose, channels)
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
@@ -157,10 +146,9 @@ class _DepthDataset(Dataset):
         assert pose is not None
         return self._depth(position), Pose.from_matrix(pose).orthonormal().matrix
 
+    @abstractmethod
     def _depth(self, index: int) -> Tensor:
         """Depth (H, W) in metres, float64; 0 for invalid pixels."""
-        path = self._files[index]
-        return metric(read_png(path, str(path)), self.depth_scale)
 
 
 class DepthFrames(_DepthDataset):
@@ -169,7 +157,7 @@ class DepthFrames(_DepthDataset):
     Pixels at a distance of `max_range` metres or beyond have no return. Depths 0 and 65535 are invalid
     and dropped. An image whose middle is far from the principal point is refused: it has another size than
     the intrinsics. `up` is the axis of the world frame of the pose files that points up; the frame is turned
-    so that it becomes z. `attributes` can be ["colour"].
+    so that it becomes z.
     """
 
     def __init__(
@@ -216,20 +204,20 @@ class DepthFrames(_DepthDataset):
         return next(filter(Path.is_file, files), None)
 
     def _depth(self, index: int) -> Tensor:
-        depth = super()._depth(index)
+        path = self._files[index]
+        depth = metric(read_png(path, str(path)), self.depth_scale)
         height, width = depth.shape
         if not is_centered(self.intrinsics, (height, width)):
             (_, _, cx), (_, _, cy), _ = self.intrinsics.tolist()
             raise DataError(
-                f"{self._files[index]} has {width}×{height} pixels, but camera-intrinsics.txt is for images "
+                f"{path} has {width}×{height} pixels, but camera-intrinsics.txt is for images "
                 f"of about {2 * cx:.0f}×{2 * cy:.0f}: its principal point is not near the middle of the "
                 "image. Scale the intrinsics, or give the images in full size."
             )
         return depth
 
     def _known_pose(self, index: int) -> Tensor:
-        path = self._files[index]
-        path = path.with_name(path.name.replace(".depth.png", ".pose.txt"))
+        path = self._files[index].with_name(self._files[index].name.replace(".depth.png", ".pose.txt"))
         pose = check_poses(_matrix(path, 4), str(path))
         return torch.cat([self._upright @ pose[:3], pose[3:]])
 
@@ -298,8 +286,8 @@ class TumRgbd(_DepthDataset):
     """Depth images as scans, in the order of their times, with poses interpolated at their times.
 
     Images without a pose are left out and counted. poses: another trajectory file with times; None:
-    groundtruth.txt. intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5. attributes: can be
-    ["colour"]: of the image in rgb.txt that is nearest in time, within 20 ms.
+    groundtruth.txt. intrinsics: fx, fy, cx, cy in pixels; None: `_INTRINSICS`. Colours are those of the image
+    in rgb.txt that is nearest in time, within 20 ms.
     """
 
     _poses: Tensor

@@ -42,23 +42,7 @@ from gmmtorch.pose import Pose
 from gmmtorch.scan import INTENSITY, Scan
 
 
-class _CloudFiles(Dataset):
-    """Scans in point files, whose points have channels if `attributes` names them, see `read_channels`."""
-
-    attributes: tuple[str, ...]
-    _files: list[Path]
-
-    def _count(self) -> int:
-        return len(self._files)
-
-    def _channels(self, index: int) -> dict[str, Tensor]:
-        """The channels of the points of a scan that it has; a scan that lacks some is counted."""
-        channels = read_channels(self._files[index], self.attributes) if self.attributes else {}
-        self._without(set(self.attributes) - channels.keys(), index)
-        return channels
-
-
-class ScanFolder(_CloudFiles):
+class ScanFolder(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` have no return. NaN, infinite points and points at the sensor origin are
@@ -66,7 +50,7 @@ class ScanFolder(_CloudFiles):
     poses.txt is not read, and every scan is in the frame of the sensor.
     """
 
-    _poses: torch.Tensor
+    _poses: Tensor
 
     def __init__(
         self,
@@ -105,10 +89,18 @@ class ScanFolder(_CloudFiles):
             usual |= points.isnan()  # a beam without return
         if not bool(usual.all()):
             self._skip("points dropped: their coordinates are not finite", index)
-        return self.ranges.posed(points, self._poses[index], self._channels(index))
+        channels = _noted_channels(self, self._files[index], index)
+        return self.ranges.posed(points, self._poses[index], channels)
 
 
-def _read_poses(path: Path) -> torch.Tensor:
+def _noted_channels(scans: Dataset, file: Path, index: int) -> dict[str, Tensor]:
+    """The channels in a file of those that are wanted; a scan that lacks some is counted."""
+    channels = read_channels(file, scans.attributes) if scans.attributes else {}
+    scans._note_missing(channels, index)
+    return channels
+
+
+def _read_poses(path: Path) -> Tensor:
     """Poses (S, 4, 4) of a file of KITTI rows."""
     if not path.is_file():
         raise DataError(
@@ -121,7 +113,7 @@ def _read_poses(path: Path) -> torch.Tensor:
     return kitti_poses(path, rows).matrix
 
 
-class PcdViewpoint(_CloudFiles):
+class PcdViewpoint(Dataset):
     """Scans in the natural order of their file names (scan_2 before scan_10).
 
     Points at or beyond `max_range` from the viewpoint have no return. NaN, infinite points and points at the
@@ -143,16 +135,17 @@ class PcdViewpoint(_CloudFiles):
         if not self._files:
             raise DataError(f"{path} contains no .pcd file.")
 
-    def _known_pose(self, index: int) -> torch.Tensor:
+    def _known_pose(self, index: int) -> Tensor:
         """The position in VIEWPOINT with the rotation of the world frame."""
         return Pose.from_yaw(0.0, _viewpoint(self._files[index])).matrix
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        return self.ranges.scan(read_cloud(path), _viewpoint(path), None, self._channels(index))
+        channels = _noted_channels(self, path, index)
+        return self.ranges.scan(read_cloud(path), _viewpoint(path), None, channels)
 
 
-def _viewpoint(path: Path) -> torch.Tensor:
+def _viewpoint(path: Path) -> Tensor:
     """The sensor position (3,) in the header of a PCD file."""
     words = pcd_header(path).get("VIEWPOINT", [])
     if len(words) not in (3, 7):
@@ -175,13 +168,8 @@ _CALIBRATION = "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
 class _BinaryClouds(Dataset):
     """Scans in files of float32: x, y, z and intensity, and further numbers up to `_width`."""
 
-    attributes: tuple[str, ...]
-    _files: list[Path]
     _poses: Tensor
     _width = 4
-
-    def _count(self) -> int:
-        return len(self._files)
 
     def _read(self, index: int) -> Scan:
         """The scan of the points that are finite and not at the sensor."""
@@ -237,7 +225,7 @@ class Kitti(_BinaryClouds):
         times = read_rows(path / "times.txt")[:, 0] if (path / "times.txt").is_file() else None
         if times is not None and len(times) < len(files):
             raise DataError(f"{path / 'times.txt'} has {len(times)} rows for {len(files)} scans.")
-        trajectory = read_trajectory(poses or _find_poses(path))
+        trajectory = read_trajectory(poses or _poses_file(path))
         if poses is not None and trajectory.has_times:
             if times is None:
                 raise DataError(
@@ -277,11 +265,9 @@ def _kitti_labels(scan: Path, n_points: int) -> np.ndarray:
     return np.where(labels == 0, -1, labels)
 
 
-def _find_poses(path: Path) -> Path:
+def _poses_file(path: Path) -> Path:
     beside = path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt"
-    if (path / "poses.txt").is_file() or not beside.is_file():
-        return path / "poses.txt"
-    return beside
+    return beside if beside.is_file() and not (path / "poses.txt").is_file() else path / "poses.txt"
 
 
 def _of_lidar(path: Path, trajectory: Trajectory, n_scans: int) -> Pose:

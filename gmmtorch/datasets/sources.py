@@ -23,9 +23,9 @@ _READERS = {
     "nuscenes": "scan_folders.NuScenes",
     "tum": "depth_images.TumRgbd",
     "mesh": "synthetic.MeshSamples",
-    "mesh_scans": "synthetic.MeshScans",
-    "synthetic_building": "synthetic.SyntheticBuilding",
-    "synthetic_building_2d": "synthetic.SyntheticBuilding2D",
+    "mesh_scans": "synthetic.mesh_scans",
+    "synthetic_building": "synthetic.synthetic_building",
+    "synthetic_building_2d": "synthetic.synthetic_building_2d",
 }
 _SIMULATED = ("synthetic_building", "synthetic_building_2d")
 """Data sets without a path."""

@@ -6,6 +6,7 @@ A scan depends only on the world, the seed and its index, not on the order of re
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -41,18 +42,25 @@ _CAMERA_PITCH = math.radians(8)
 _CAMERA_SWING = math.radians(60)
 
 
-class _Simulated(Dataset):
+class Simulated(Dataset):
     """Scans along the path of a simulated world.
 
     Beams without a surface within the sensor's maximum range, or within `max_range` if that is shorter,
     have no return. No beam is invalid.
+
+    Args:
+        make: the world, the sensor, and its poses, drawn with a generator.
     """
 
-    world: World
-    sensor: RangeSensor
-    poses: Tensor
-
-    def __init__(self, name: str, ranges: Ranges, stride: int, seed: int, n_scans: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        ranges: Ranges,
+        stride: int,
+        seed: int,
+        n_scans: int,
+        make: Callable[[torch.Generator], tuple[World, RangeSensor, Tensor]],
+    ) -> None:
         self.seed = check_whole("seed", seed, 0)
         self.n_scans = check_whole("n_scans", n_scans, 1)
         if seed >= _MOST_SEEDS or n_scans >= _SEEDS_APART:
@@ -60,6 +68,8 @@ class _Simulated(Dataset):
                 f"seed={seed} and n_scans={n_scans} must be below {_MOST_SEEDS} and {_SEEDS_APART}."
             )
         super().__init__(name, ranges, stride)
+        self.world, self.sensor, self.poses = make(self._generator(0))
+        self._poses = self.poses
 
     def _generator(self, number: int) -> torch.Generator:
         """Random number generator of the world (0) or of scan `number` − 1."""
@@ -68,39 +78,43 @@ class _Simulated(Dataset):
     def _count(self) -> int:
         return self.n_scans
 
-    def _known_pose(self, index: int) -> Tensor:
-        return self.poses[index]
-
     def _read(self, index: int) -> Scan:
         pose = self.poses[index]
         ends, no_return = sense(self.sensor, pose, self.world, self._generator(1 + index))
         return self.ranges.scan(ends, pose[:-1, -1], no_return)
 
 
-class SyntheticBuilding2D(_Simulated):
+def synthetic_building_2d(ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 120) -> Simulated:
     """A laser (180 beams over 180°, range 12 m, noise 1 cm) on a path through an office of 30 × 20 m."""
 
-    def __init__(self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 120) -> None:
-        super().__init__("synthetic_building_2d", ranges, stride, seed, n_scans)
-        self.world = world = building_2d(self._generator(0))
-        self.sensor = laser_2d(max_range=_MAX_RANGE_2D)
-        self.poses = poses_2d(world.path, n_scans)
+    def make(generator: torch.Generator) -> tuple[World, RangeSensor, Tensor]:
+        world = building_2d(generator)
+        return world, laser_2d(max_range=_MAX_RANGE_2D), poses_2d(world.path, n_scans)
+
+    return Simulated("synthetic_building_2d", ranges, stride, seed, n_scans, make)
 
 
-class SyntheticBuilding(_Simulated):
+def synthetic_building(
+    ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 40, sensor: str = "lidar"
+) -> Simulated:
     """A lidar (32 × 160 beams) or depth camera (80 × 64 pixels) in a furnished hall; 10 m, noise 1 cm."""
 
-    def __init__(
-        self, ranges: Ranges, stride: int = 1, seed: int = 0, n_scans: int = 40, sensor: str = "lidar"
-    ) -> None:
-        super().__init__("synthetic_building", ranges, stride, seed, n_scans)
-        self.sensor = _sensor_3d(sensor, _MAX_RANGE_3D)
-        self.world = world = building_3d(self._generator(0))
+    def make(generator: torch.Generator) -> tuple[World, RangeSensor, Tensor]:
+        device, world = _sensor_3d(sensor, _MAX_RANGE_3D), building_3d(generator)
         mount = (_LIDAR_HEIGHT,) if sensor == "lidar" else (_CAMERA_HEIGHT, _CAMERA_PITCH, _CAMERA_SWING)
-        self.poses = poses_3d(world.path, n_scans, *mount)
+        return world, device, poses_3d(world.path, n_scans, *mount)
+
+    return Simulated("synthetic_building", ranges, stride, seed, n_scans, make)
 
 
-class MeshScans(_Simulated):
+def mesh_scans(
+    path: str | Path,
+    ranges: Ranges,
+    stride: int = 1,
+    n_scans: int = 100,
+    sensor: str = "lidar",
+    seed: int = 0,
+) -> Simulated:
     """`n_scans` scans of a lidar (32 × 160 beams) or a depth camera (80 × 64 pixels), range 30 m, noise 1 cm.
 
     The sensor moves through the largest connected part of the mesh (PLY, OBJ or STL; metres, z up), 1.2 m
@@ -108,21 +122,16 @@ class MeshScans(_Simulated):
     the mesh beyond the last one are not observed. Scan i depends only on the mesh, the seed, the number of
     scans and i.
     """
+    file = require_path(path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up.")
 
-    def __init__(
-        self,
-        path: str | Path,
-        ranges: Ranges,
-        stride: int = 1,
-        n_scans: int = 100,
-        sensor: str = "lidar",
-        seed: int = 0,
-    ) -> None:
-        file = require_path(path, "file", "a triangle mesh (PLY, OBJ, STL)", "Units are metres, z is up.")
-        super().__init__(file.stem, ranges, stride, seed, n_scans)
-        self.sensor = _sensor_3d(sensor, _MAX_RANGE_MESH)
-        self.world = world = MeshWorld(read_triangles(file))
-        self.poses = _forward(world.tour(n_scans))
+    def make(_: torch.Generator) -> tuple[World, RangeSensor, Tensor]:
+        device, world = _sensor_3d(sensor, _MAX_RANGE_MESH), MeshWorld(read_triangles(file))
+        places = world.tour(n_scans)
+        steps = places.diff(dim=0) if len(places) > 1 else torch.zeros_like(places)
+        ahead = torch.cat([steps, steps[-1:]])[: len(places)]  # x points towards the next place
+        return world, device, Pose.from_yaw(torch.atan2(ahead[:, 1], ahead[:, 0]), places).matrix
+
+    return Simulated(file.stem, ranges, stride, seed, n_scans, make)
 
 
 class MeshSamples(Dataset):
@@ -180,13 +189,6 @@ def sample_surface(triangles: Tensor, n_points: int, generator: torch.Generator)
     u, v = torch.rand(2, n_points, 1, generator=generator, dtype=torch.float64)
     a, b, c = triangles[chosen].unbind(1)
     return a + u.sqrt() * ((1 - v) * (b - a) + v * (c - a))
-
-
-def _forward(places: Tensor) -> Tensor:
-    """Poses (S, 4, 4), world ← sensor, at places (S, 3) of a path, x towards the next place."""
-    steps = places.diff(dim=0) if len(places) > 1 else torch.zeros_like(places)
-    ahead = torch.cat([steps, steps[-1:]])[: len(places)]
-    return Pose.from_yaw(torch.atan2(ahead[:, 1], ahead[:, 0]), places).matrix
 
 
 def _sensor_3d(name: str, max_range: float) -> RangeSensor:

@@ -398,16 +398,21 @@ def test_forms_of_pcap_are_read(tmp_path, order, magic, unit, link):
     }[link]
     data += struct.pack(order + "IIII", 7, unit // 4, len(frame), len(frame)) + frame
     (tmp_path / "a.pcap").write_bytes(data)
-    found = []
-    Capture(tmp_path / "a.pcap", found.append)
-    assert [(one.time, one.port, one.data) for one in found] == [(7_250_000_000, 2368, b"content!")]
+    ((connection, *found),) = messages_in(tmp_path / "a.pcap")
+    assert connection.topic.endswith("/2368")
+    assert found == [7_250_000_000, b"content!"]
 
 
 def test_parts_of_datagrams_are_joined_in_any_order_and_lost_ones_are_left_out(tmp_path):
     parts = [frames(bytes([number]) * 5000, 7, number=number) for number in range(3)]
     sent = [parts[0][2], parts[1][0], parts[0][0], parts[0][3], parts[0][1], parts[0][1], *parts[2][1:]]
     found = captured(tmp_path, sent)
-    assert [one.data for one in found] == [bytes(5000)]
+    assert [content for *_, content in found] == [bytes(5000)]
+
+
+def messages_in(path: Path) -> list:
+    capture = Capture(path)
+    return list(capture.messages(capture.connections))
 
 
 def captured(folder: Path, sent: list[bytes]) -> list:
@@ -415,9 +420,7 @@ def captured(folder: Path, sent: list[bytes]) -> list:
     for frame in sent:
         data += struct.pack("<IIII", 1, 0, len(frame), len(frame)) + frame
     (folder / "a.pcap").write_bytes(data)
-    found = []
-    Capture(folder / "a.pcap", found.append)
-    return found
+    return messages_in(folder / "a.pcap")
 
 
 def test_parts_that_never_end_take_bounded_memory(tmp_path):
@@ -425,7 +428,8 @@ def test_parts_that_never_end_take_bounded_memory(tmp_path):
 
     sent = [frames(bytes(60_000), 7, number=number, mtu=59_200)[0] for number in range(700)]
     tracemalloc.start()
-    assert captured(tmp_path, sent) == []
+    with pytest.raises(DataError, match="no UDP datagram"):
+        captured(tmp_path, sent)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 110e6  # of which the test's own bytes are 84 MB

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
+from gmmtorch.datasets.packets.sweeps import PACKET, is_lidar
+from gmmtorch.datasets.ros.bag_files import Connection
 from gmmtorch.datasets.trajectory import NANOSECONDS
 from gmmtorch.errors import DataError
 
@@ -35,37 +38,35 @@ _CUT = "the file is cut off there"
 _DAMAGED = "the blocks after it contradict each other"
 
 
+_MOST_TOPICS = 256
+_DATAGRAMS = "UDP datagrams"
+"""The type of datagrams that are not of a lidar, which are not read."""
+
+_Frame = tuple[int, int, int, bytes]
+"""A frame in a file: its first byte, its time (ns), the type of its link, and its content."""
+
+
 class Datagram(NamedTuple):
-    """A UDP datagram. time: of capture, ns. source: address of the sender. port: of the receiver."""
+    """A UDP datagram. time: of capture, ns. topic: the address of its sender and the port of its receiver."""
 
     time: int
-    source: str
-    port: int
-    data: bytes
-
-
-class _Frame(NamedTuple):
-    """A frame in a file. place: its first byte. time: ns. link: its type."""
-
-    place: int
-    time: int
-    link: int
+    topic: str
     data: bytes
 
 
 class Capture:
-    """The datagrams of a capture file, which is read once when it is opened.
+    """The UDP datagrams in a capture file as messages. Each sender and port is a topic.
 
-    Args:
-        note: is called with each datagram then.
+    The file is read once when it is opened.
 
     Attributes:
+        connections: of lidars, and of other senders.
         damage: why the file could not be read to its end, or "".
 
-    Raises `DataError` if it is not a capture.
+    Raises `DataError` if it is not a capture, or has no UDP datagram.
     """
 
-    def __init__(self, path: Path, note: Callable[[Datagram], None]) -> None:
+    def __init__(self, path: Path) -> None:
         self.path, self.damage = path, ""
         self._length = path.stat().st_size
         self._interfaces: list[tuple[int, int]] = []  # type of link, units of time in a second
@@ -84,27 +85,37 @@ class Capture:
         else:
             raise DataError(f"{path} is not a network capture of tcpdump or Wireshark; capture it again.")
         starts, latest, time, n = array("q", [self._begin]), array("q", [-1]), -1, 0
-        parts = _Parts()
+        parts, counts, lidars = _Parts(), Counter[str](), set[str]()
         for n, frame in enumerate(self._frames(self._begin, is_first=True), 1):
             if n % _INDEX_STEP == 0:
-                starts.append(frame.place)
+                starts.append(frame[0])
                 latest.append(time)
-            time = max(time, frame.time)
+            time = max(time, frame[1])
             found = parts.added(frame)
-            if found is not None:
-                note(found)
+            if found is not None and (found.topic in counts or len(counts) < _MOST_TOPICS):
+                counts[found.topic] += 1
+                if is_lidar(found.data):
+                    lidars.add(found.topic)
         self._places, self._latest = np.array(starts), np.array(latest)
         if self.damage:
             self.damage = f"{n:,} frames are intact; {self.damage}"
+        if not counts:
+            raise DataError(f"{path} contains no UDP datagram over IPv4; capture the port of the lidar.")
+        self.connections = [
+            Connection(number, topic, PACKET if topic in lidars else _DATAGRAMS, n_messages=n)
+            for number, (topic, n) in enumerate(counts.items())
+        ]
 
-    def datagrams(self, start: int | None = None) -> Iterator[Datagram]:
-        """The datagrams in the order of the file, or those from a time on (ns)."""
+    def messages(
+        self, connections: Collection[Connection], start: int | None = None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """(connection, time in ns, content) of the datagrams of some topics, from a time on."""
+        wanted, parts = {one.topic: one for one in connections}, _Parts()
         row = 0 if start is None else max(0, int(np.searchsorted(self._latest, start)) - 1)
-        parts = _Parts()
         for frame in self._frames(int(self._places[row])):
             found = parts.added(frame)
-            if found is not None and (start is None or found.time >= start):
-                yield found
+            if found is not None and found.topic in wanted and (start is None or found.time >= start):
+                yield wanted[found.topic], found.time, found.data
 
     def _frames(self, place: int, is_first: bool = False) -> Iterator[_Frame]:
         """The frames from a place of the file on. The first time, interfaces and damage are noted."""
@@ -124,7 +135,7 @@ class Capture:
         seconds, fraction, size, _ = struct.unpack(self._order + "4I", file.read(16))
         link, units = self._interfaces[0]
         time = seconds * NANOSECONDS + fraction * (NANOSECONDS // units)
-        return _Frame(here, time, link, self._content(file, size))
+        return here, time, link, self._content(file, size)
 
     def _content(self, file: BinaryIO, size: int) -> bytes:
         """The next bytes of the file."""
@@ -156,7 +167,7 @@ class Capture:
             raise DataError(_DAMAGED)
         link, units = self._interfaces[number]
         time = (high << 32 | low) * NANOSECONDS // units
-        return _Frame(here, min(time, (1 << 63) - 1), link, body[20 : 20 + size])
+        return here, min(time, (1 << 63) - 1), link, body[20 : 20 + size]
 
     def _interface(self, body: bytes) -> tuple[int, int]:
         """Type of link, and units of time in a second."""
@@ -179,23 +190,23 @@ class _Parts:
 
     def added(self, frame: _Frame) -> Datagram | None:
         """The datagram that a frame completes; None if it is not UDP over IPv4, or parts are missing."""
-        packet = _ip_packet(frame)
+        _, time, link, data = frame
+        packet = _ip_packet(link, data)
         if packet is None:
             return None
         words = int.from_bytes(packet[6:8], "big")
         place, has_more = (words & 0x1FFF) * 8, bool(words & 0x2000)
-        source, payload = packet[12:16], packet[(packet[0] & 15) * 4 :]
+        payload: bytes = packet[(packet[0] & 15) * 4 :]
+        joined: bytes | None = payload
         if place or has_more:
-            time, joined = self._joined(frame.time, packet[4:6] + packet[12:20], place, has_more, payload)
-        else:
-            time, joined = frame.time, payload
+            time, joined = self._joined(time, packet[4:6] + packet[12:20], place, has_more, payload)
         if joined is None or len(joined) < 8:
             return None
         length = int.from_bytes(joined[4:6], "big")
         if not 8 <= length <= len(joined):
             return None
-        name = ".".join(map(str, source))
-        return Datagram(time, name, int.from_bytes(joined[2:4], "big"), joined[8:length])
+        topic = f"/{'.'.join(map(str, packet[12:16]))}/{int.from_bytes(joined[2:4], 'big')}"
+        return Datagram(time, topic, joined[8:length])
 
     def _joined(
         self, now: int, key: bytes, place: int, has_more: bool, payload: bytes
@@ -227,13 +238,12 @@ class _Parts:
         self._n_bytes -= sum(map(len, parts.values()))
 
 
-def _ip_packet(frame: _Frame) -> bytes | None:
-    """The IPv4 packet with UDP in a frame; None if it has none."""
-    at = _LINKS.get(frame.link)
+def _ip_packet(link: int, data: bytes) -> bytes | None:
+    """The IPv4 packet with UDP in the content of a frame; None if it has none."""
+    at = _LINKS.get(link)
     if at is None:
         return None
-    data = frame.data
-    if frame.link == _ETHERNET:
+    if link == _ETHERNET:
         while data[at - 2 : at] in _VLAN:
             at += 4
         if data[at - 2 : at] != _IPV4:

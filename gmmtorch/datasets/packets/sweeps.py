@@ -7,25 +7,17 @@ a network capture.
 from __future__ import annotations
 
 import struct
-from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 from gmmtorch.datasets.packets import hesai, ouster
-from gmmtorch.datasets.packets.captures import Capture, Datagram
-from gmmtorch.datasets.ros.bag_files import Connection
 from gmmtorch.datasets.trajectory import NANOSECONDS
-from gmmtorch.errors import DataError
 
 VELODYNE_BYTES = 1206
 _BACK = 36.0
 """A turn ends where the azimuth jumps back by more degrees: packets can overtake each other."""
 _MOST_PACKETS, _MOST_BYTES = 1 << 14, 1 << 26  # of a sweep
-_MOST_TOPICS = 256
 
 SWEEP = "lidar_packets/msg/Sweep"
-_DATAGRAMS = "UDP datagrams"
-"""The type of other datagrams in a capture, which are not read."""
 DEFINITION = (
     f"std_msgs/Header header\nlidar_packets/Packet[] packets\n{'=' * 80}\n"
     "MSG: lidar_packets/Packet\nbuiltin_interfaces/Time stamp\nuint8[] data\n"
@@ -102,46 +94,3 @@ def packed(sweep: Sequence[tuple[int, bytes]], frame: str, is_ros1: bool) -> byt
     for time, data in sweep:
         found += bytes(-len(found) % pad) + struct.pack("<III", *divmod(time, NANOSECONDS), len(data)) + data
     return bytes(found) if is_ros1 else b"\0\1\0\0" + found
-
-
-# -- captures ----------------------------------------------------------------------------------------
-
-
-class CaptureMessages:
-    """The UDP datagrams in a network capture as messages. Each sender and port is a topic.
-
-    Attributes:
-        connections: of lidars, and of other senders.
-        damage: of the file, see `Capture`.
-
-    Raises `DataError` if the file is not a capture, or has no UDP datagram.
-    """
-
-    def __init__(self, path: Path) -> None:
-        counts, lidars = Counter[str](), set[str]()
-
-        def note(one: Datagram) -> None:
-            topic = f"/{one.source}/{one.port}"
-            if topic in counts or len(counts) < _MOST_TOPICS:
-                counts[topic] += 1
-                if is_lidar(one.data):
-                    lidars.add(topic)
-
-        self._capture = Capture(path, note)
-        self.damage = self._capture.damage
-        if not counts:
-            raise DataError(f"{path} contains no UDP datagram over IPv4; capture the port of the lidar.")
-        self.connections = [
-            Connection(number, topic, PACKET if topic in lidars else _DATAGRAMS, n_messages=n)
-            for number, (topic, n) in enumerate(counts.items())
-        ]
-
-    def messages(
-        self, connections: Collection[Connection], start: int | None = None
-    ) -> Iterator[tuple[Connection, int, bytes]]:
-        """(connection, time in ns, content) of the datagrams of some topics, from a time on."""
-        wanted = {one.topic: one for one in connections}
-        for one in self._capture.datagrams(start):
-            found = wanted.get(f"/{one.source}/{one.port}")
-            if found is not None:
-                yield found, one.time, one.data

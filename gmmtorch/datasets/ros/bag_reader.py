@@ -17,16 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmmtorch.datasets.packets.captures import SUFFIXES as CAPTURES
+from gmmtorch.datasets.packets.captures import Capture
 from gmmtorch.datasets.packets.sweeps import DEFINITION as SWEEP_DEFINITION
-from gmmtorch.datasets.packets.sweeps import (
-    SINGLE_PACKETS,
-    SWEEP,
-    CaptureMessages,
-    Sweeps,
-    is_lidar,
-    packed,
-    packet_of,
-)
+from gmmtorch.datasets.packets.sweeps import SINGLE_PACKETS, SWEEP, Sweeps, is_lidar, packed, packet_of
 from gmmtorch.datasets.ros.bag_files import BagFiles
 from gmmtorch.datasets.ros.message_decoder import MessageDecoder
 from gmmtorch.datasets.trajectory import NANOSECONDS
@@ -88,7 +81,7 @@ class BagReader:
         with needs_extra("ROS bags and network captures need", "rosbags", "bags"):
             import rosbags.rosbag2  # noqa: F401
         self._is_ros1 = self.path.suffix == ".bag"
-        self._reader = CaptureMessages(self.path) if self.path.suffix in CAPTURES else self._opened()
+        self._reader = Capture(self.path) if self.path.suffix in CAPTURES else self._opened()
         self._connections = self._reader.connections
         sweep = parsed_definitions("MSG", SWEEP_DEFINITION, SWEEP)
         self._decoder = MessageDecoder(
@@ -165,7 +158,7 @@ class BagReader:
     @property
     def damage(self) -> str:
         """What is missing in a damaged bag; "" if nothing is."""
-        if isinstance(self._reader, CaptureMessages):
+        if isinstance(self._reader, Capture):
             return self._reader.damage
         found, first = self._reader, self._reader.first
         n_stated, end = _stated(self.path)
