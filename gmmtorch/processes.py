@@ -9,8 +9,7 @@ import threading
 import time
 from typing import Any
 
-_PERIOD = 0.5
-"""Seconds between checks whether the parent process is alive."""
+_PERIOD = 0.5  # seconds between checks whether the parent process is alive
 
 
 def has_lost_parent(process: str) -> bool:

@@ -9,8 +9,7 @@ from typing import Any, get_type_hints
 from gmmtorch.declarations import default_of, option, repeated
 from gmmtorch.errors import InvalidArgumentError, MissingDataError
 
-_REQUIRED = "???"
-"""A value that must be given, as Hydra writes it."""
+_REQUIRED = "???"  # a value that must be given, as Hydra writes it
 SUFFIXES = (".npy", ".las", ".laz", ".pcd", ".ply")
 """Suffixes of the files of points that are read in chunks."""
 

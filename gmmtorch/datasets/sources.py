@@ -27,8 +27,7 @@ _READERS = {
     "synthetic_building": "synthetic.synthetic_building",
     "synthetic_building_2d": "synthetic.synthetic_building_2d",
 }
-_SIMULATED = ("synthetic_building", "synthetic_building_2d")
-"""Data sets without a path."""
+_SIMULATED = ("synthetic_building", "synthetic_building_2d")  # data sets without a path
 
 
 def load(

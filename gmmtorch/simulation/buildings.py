@@ -58,8 +58,7 @@ from gmmtorch.simulation.mesh_world import MeshWorld, checked_rays
 from gmmtorch.simulation.sensors import smooth_path
 
 _THICKNESS = 0.2
-_CHUNK_PAIRS = 1 << 15
-"""Ray and segment pairs processed at a time."""
+_CHUNK_PAIRS = 1 << 15  # ray and segment pairs processed at a time
 
 _SLACK = 64 * torch.finfo(torch.float64).eps
 """Relative distance outside an end at which a ray still counts as a hit, so that no ray passes between two

@@ -17,18 +17,15 @@ from torch import Tensor
 from gmmtorch.errors import InvalidArgumentError
 
 _ATTEMPTS = 40
-_CLEARANCE = 0.6
-"""Least distance of furniture from the path, metres."""
-_GAP = 0.2
-"""Least distance between two pieces of furniture, metres."""
+_CLEARANCE = 0.6  # least distance of furniture from the path, metres
+_GAP = 0.2  # least distance between two pieces of furniture, metres
 CEILING = 4.0
 _BOARD = 0.03
 
 RACK_DEPTH = 1.1
 _UPRIGHT = 0.1
 _PALLET = 0.14
-_FREE_ABOVE = 0.2
-"""Least distance between goods and the deck above, metres."""
+_FREE_ABOVE = 0.2  # least distance between goods and the deck above, metres
 
 _SLOTS = 2
 

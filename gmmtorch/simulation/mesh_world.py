@@ -20,11 +20,9 @@ _log = logging.getLogger(__name__)
 _MIN_AREA = 1e-12
 """Smallest ratio of a triangle's area to the square of its longest edge; below it the triangle is dropped."""
 
-_FLOORS = 8
-"""Largest number of floors, one above another, that are searched for."""
+_FLOORS = 8  # largest number of floors, one above another, that are searched for
 
-_ENCLOSED = 0.75
-"""Share of the horizontal directions in which a surface must be in sight of an indoor place."""
+_ENCLOSED = 0.75  # share of the horizontal directions in which a surface must be in sight of an indoor place
 
 
 def checked_triangles(triangles: Tensor, name: str = "mesh") -> Tensor:

@@ -19,11 +19,9 @@ from gmmtorch.optional_packages import load_open3d
 from gmmtorch.simulation.furniture import checked_size, uniform
 from gmmtorch.simulation.mesh_world import have_area
 
-_CELL = 0.4
-"""Spacing of the field's grid, metres."""
+_CELL = 0.4  # spacing of the field's grid, metres
 
-_ROUGHNESS = 0.25
-"""Amplitude of the noise on walls and floor, metres."""
+_ROUGHNESS = 0.25  # amplitude of the noise on walls and floor, metres
 
 _ROCK = 1.5
 """Value of the field in solid rock, and largest distance from a gallery at which the field is computed."""

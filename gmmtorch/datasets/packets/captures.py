@@ -39,8 +39,7 @@ _DAMAGED = "the blocks after it contradict each other"
 
 
 _MOST_TOPICS = 256
-_DATAGRAMS = "UDP datagrams"
-"""The type of datagrams that are not of a lidar, which are not read."""
+_DATAGRAMS = "UDP datagrams"  # the type of datagrams that are not of a lidar, which are not read
 
 _Frame = tuple[int, int, int, bytes]
 """A frame in a file: its first byte, its time (ns), the type of its link, and its content."""

@@ -45,7 +45,7 @@ class LidarPackets:
         """
         packets = [bytes(packet["data"][: packet.get("size")]) for packet in message["packets"]]
         if not packets:
-            return reading(np.empty((0, 3)), None, None)
+            return reading(np.empty((0, 3)))
         model = hesai.model_of(packets[0])
         if len(packets[0]) == VELODYNE_BYTES:
             return self._velodyne(message, packets, wanted)

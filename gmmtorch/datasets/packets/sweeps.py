@@ -13,8 +13,7 @@ from gmmtorch.datasets.packets import hesai, ouster
 from gmmtorch.datasets.trajectory import NANOSECONDS
 
 VELODYNE_BYTES = 1206
-_BACK = 36.0
-"""A turn ends where the azimuth jumps back by more degrees: packets can overtake each other."""
+_BACK = 36.0  # a turn ends where the azimuth jumps back by more degrees: packets can overtake each other
 _MOST_PACKETS, _MOST_BYTES = 1 << 14, 1 << 26  # of a sweep
 
 SWEEP = "lidar_packets/msg/Sweep"

@@ -14,8 +14,7 @@ from gmmtorch.datasets.point_files.point_rows import AXES, check_count
 from gmmtorch.errors import DataError, GmmTorchError
 from gmmtorch.optional_packages import needs_extra
 
-_LAS_BLOCK_BYTES = 1 << 25
-"""Limit of one read: a point may announce 64 kB of extra bytes."""
+_LAS_BLOCK_BYTES = 1 << 25  # limit of one read: a point may announce 64 kB of extra bytes
 _SIZES = struct.Struct("<4s20x2B68xHII")  # of the header, to the number of its records, 104 bytes
 _RECORD_BYTES = 54  # of a variable-length record, at least
 _MAX_CHUNK_POINTS = 1 << 22

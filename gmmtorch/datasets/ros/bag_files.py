@@ -137,11 +137,6 @@ class BagFiles:
         of = np.full_like(ids, len(self._sources) - 1)
         return np.column_stack([rows[:, 0], of, ids, rows[:, 2:]])[ids >= 0]
 
-    @property
-    def missing_seconds(self) -> float:
-        """Seconds between intact messages whose messages are lost."""
-        return sum(end - begin for begin, end in self.gaps) / NANOSECONDS
-
     def messages(
         self, connections: Collection[Connection], start: int | None = None
     ) -> Iterator[tuple[Connection, int, bytes]]:
@@ -395,12 +390,11 @@ class _Mcap(_Chunked):
         self._channels: dict[int, tuple[int, str]] = {}
 
     def connections(self) -> dict[int, Connection]:
-        found = {}
-        for key, (schema, topic) in self._channels.items():
-            if schema in self._schemas:
-                kind, encoding, text = self._schemas[schema]
-                found[key] = _connection(topic, kind, _MCAP_FORMS.get(encoding, ""), text)
-        return found
+        return {
+            key: _connection(topic, *self._schemas[schema])
+            for key, (schema, topic) in self._channels.items()
+            if schema in self._schemas
+        }
 
     def _first(self) -> int:
         if self._data[: len(_MCAP_MAGIC)] != _MCAP_MAGIC:
@@ -453,7 +447,7 @@ class _Mcap(_Chunked):
         if kind == _MCAP_SCHEMA:
             name, at = _mcap_text(content, 2)
             encoding, at = _mcap_text(content, at)
-            self._schemas[key] = name, encoding, _mcap_text(content, at)[0]
+            self._schemas[key] = name, _MCAP_FORMS.get(encoding, ""), _mcap_text(content, at)[0]
         else:
             topic, at = _mcap_text(content, 4)
             if _mcap_text(content, at)[0] == "cdr":
@@ -524,14 +518,13 @@ class _Database:
         texts: dict[str, tuple[str, str]] = {}
         with suppress(self._error):  # older recordings have no definitions
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            texts = {
-                kind: (_MCAP_FORMS.get(form, ""), text) for kind, form, text in self._database.execute(query)
-            }
-        found = {}
-        for key, topic, kind in self._database.execute("SELECT id, name, type FROM topics"):
-            if isinstance(topic, str) and isinstance(kind, str):
-                found[key] = _connection(topic, kind, *texts.get(kind, ("", "")))
-        return found
+            for kind, form, text in self._database.execute(query):
+                texts[kind] = _MCAP_FORMS.get(form, ""), text
+        return {
+            key: _connection(topic, kind, *texts.get(kind, ("", "")))
+            for key, topic, kind in self._database.execute("SELECT id, name, type FROM topics")
+            if isinstance(topic, str) and isinstance(kind, str)
+        }
 
     def parts(self) -> Iterator[tuple[list[_Found], bool]]:
         """The message (time in ns, topic, row, 0) of each row, and True; none, and False, for lost rows."""

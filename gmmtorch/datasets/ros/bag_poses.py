@@ -9,6 +9,7 @@ import logging
 from array import array
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -85,19 +86,13 @@ class TfPoses(PoseSource):
 class BodyPoses(PoseSource):
     """Poses of a body from a trajectory (world ← body), and those of sensors on it (body ← sensor) by frame.
 
-    max_gap: see `Trajectory.at`. name: for messages. can_deskew: False with poses at stamps of scans only.
+    max_gap: see `Trajectory.at`. name: for messages.
     """
 
-    def __init__(
-        self,
-        trajectory: Trajectory,
-        mounts: dict[str, Pose],
-        max_gap: float,
-        name: str,
-        can_deskew: bool = True,
-    ) -> None:
+    can_deskew = True
+
+    def __init__(self, trajectory: Trajectory, mounts: dict[str, Pose], max_gap: float, name: str) -> None:
         self._trajectory, self._mounts, self._max_gap, self._name = trajectory, mounts, max_gap, name
-        self.can_deskew = can_deskew
 
     def at(self, times: np.ndarray, frame: str) -> PosesAt:
         poses = self._trajectory.at(times, self._max_gap)
@@ -215,7 +210,12 @@ class BagSurvey:
                     f"{reader.path} has no TF, so the sensor's poses are unknown. {self._remedy()}"
                 )
         elif self._pose_topic is not None:
-            self._check_pose_topic()
+            types = [t.type for t in reader.topics if t.name == poses]
+            if not set(types) <= set(POSE_TYPES):
+                raise InvalidArgumentError(
+                    f"‹poses›={poses} has messages of type {', '.join(types)}, which are not poses. "
+                    f"{self._remedy()}"
+                )
         elif poses != "standing":
             self._file = Path(str(poses)).expanduser()
             if not self._file.is_file():
@@ -274,14 +274,6 @@ class BagSurvey:
         if self._poses in (None, "tf"):
             return True
         return self._pose_topic is not None and self._extrinsic is None and self._body != ""
-
-    def _check_pose_topic(self) -> None:
-        types = [t.type for t in self._reader.topics if t.name == self._pose_topic]
-        if not set(types) <= set(POSE_TYPES):
-            raise InvalidArgumentError(
-                f"‹poses›={self._pose_topic} has messages of type {', '.join(types)}, which are not "
-                f"poses. {self._remedy()}"
-            )
 
     def _remedy(self) -> str:
         topics = [t for t in self._reader.topics if t.type in POSE_TYPES and t.n_messages]
@@ -367,7 +359,9 @@ class BagSurvey:
         if not trajectory.has_times:
             rows, stamps = [r.number for r in records], np.array([r.stamp for r in records])
             trajectory = Trajectory.from_samples(stamps, trajectory.poses[rows])
-            return BodyPoses(trajectory, mounts, np.inf, str(self._file), can_deskew=False)
+            source = BodyPoses(trajectory, mounts, np.inf, str(self._file))
+            source.can_deskew = False  # poses are known at the stamps of scans only
+            return source
         return BodyPoses(trajectory, mounts, self.max_gap, str(self._file))
 
     def _from_tf(
@@ -389,13 +383,11 @@ class BagSurvey:
 
     def _mount(self, frame: str, where: str) -> Pose:
         """body ← sensor from the static transforms."""
-        body = self._body
+        body, chain = self._body, list[str]()
         if body in ("", frame):
             return Pose.identity(3)
-        try:
+        with suppress(DataError):
             chain = self.tree.chain(frame, body) if frame in self.tree.frames else []
-        except DataError:
-            chain = []
         if not chain or self.tree.is_moving(chain):
             raise DataError(
                 f"{where}: ‹poses›={self._pose_topic} states poses of frame {body}, but TF has no "

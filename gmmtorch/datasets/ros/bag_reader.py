@@ -29,8 +29,7 @@ from gmmtorch.optional_packages import needs_extra
 _SUFFIXES = (".bag", ".mcap", ".db3", *CAPTURES)
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """Start of a compressed message: the file alone, without metadata.yaml, does not state the compression."""
-_PACKED = ".zstd"
-"""Suffix of a file that is compressed as a whole."""
+_PACKED = ".zstd"  # suffix of a file that is compressed as a whole
 _BLOCK_BYTES = 1 << 20
 _MOST_METADATA = 1 << 22  # characters
 _LEAST_MISSING = 0.05  # s at the end of a bag, below which it is whole
@@ -71,7 +70,7 @@ class BagReader:
     """The topics and messages of one bag.
 
     path: a .bag, .mcap or .db3 file, the folder of a ROS 2 bag, or a network capture. Of a damaged bag the
-    intact part is read.
+    intact part is read. is_ros1: whether messages have the packed form of ROS 1, not CDR.
 
     Raises `DataError`, which states a repair, if nothing can be read, and `GmmTorchError` without rosbags.
     """
@@ -80,7 +79,7 @@ class BagReader:
         self.path = _bag_file(path)
         with needs_extra("ROS bags and network captures need", "rosbags", "bags"):
             import rosbags.rosbag2  # noqa: F401
-        self._is_ros1 = self.path.suffix == ".bag"
+        self.is_ros1 = self.path.suffix == ".bag"
         self._reader = Capture(self.path) if self.path.suffix in CAPTURES else self._opened()
         self._connections = self._reader.connections
         sweep = parsed_definitions("MSG", SWEEP_DEFINITION, SWEEP)
@@ -89,9 +88,9 @@ class BagReader:
                 **self._own_definitions(),
                 **dict.fromkeys(SINGLE_PACKETS, sweep[SWEEP]),
                 **sweep,
-                **standard_definitions(self._is_ros1),
+                **standard_definitions(self.is_ros1),
             },
-            packed=self._is_ros1,
+            packed=self.is_ros1,
         )
 
     @property
@@ -101,11 +100,6 @@ class BagReader:
         for c in self._connections:
             counts[c.topic, c.type] = counts.get((c.topic, c.type), 0) + c.n_messages
         return [Topic(*key, count) for key, count in sorted(counts.items())]
-
-    @property
-    def is_ros1(self) -> bool:
-        """Whether messages have the packed form of ROS 1, not CDR."""
-        return self._is_ros1
 
     def fields(self, message_type: str) -> list[tuple[str, Any]]:
         """Names and kinds of the fields of a message type; empty if its definition is not known."""
@@ -126,7 +120,7 @@ class BagReader:
             if message.type not in SINGLE_PACKETS:
                 yield message
                 continue
-            key, data = (message.topic, message.type), packet_of(message.data, message.type, self._is_ros1)
+            key, data = (message.topic, message.type), packet_of(message.data, message.type, self.is_ros1)
             if is_lidar(data):
                 yield from self._sweep(*key, turns.setdefault(key, Sweeps()).add(message.time, data))
         for key, sweeps in turns.items():
@@ -134,14 +128,14 @@ class BagReader:
 
     def _sweep(self, topic: str, kind: str, packets: list[tuple[int, bytes]]) -> Iterator[RawMessage]:
         if packets:
-            data = packed(packets, SINGLE_PACKETS[kind], self._is_ros1)
+            data = packed(packets, SINGLE_PACKETS[kind], self.is_ros1)
             yield RawMessage(topic, kind, packets[0][0], data)
 
     def _messages(self, topics: Collection[str], start: int | None) -> Iterator[RawMessage]:
         """The messages as they are recorded."""
         chosen = [c for c in self._connections if c.topic in topics]
         for connection, time, data in self._reader.messages(chosen, start):
-            if not self._is_ros1 and data.startswith(_ZSTD):  # CDR starts with a zero
+            if not self.is_ros1 and data.startswith(_ZSTD):  # CDR starts with a zero
                 with suppress(DataError):  # it is counted as one that cannot be decoded
                     data = _unpacked(data, "zstd", MAX_CHUNK_BYTES - 1)
             yield RawMessage(connection.topic, connection.type, time, data)
@@ -161,22 +155,23 @@ class BagReader:
         if isinstance(self._reader, Capture):
             return self._reader.damage
         found, first = self._reader, self._reader.first
-        n_stated, end = _stated(self.path)
+        n_stated, last = _stated(self.path)
         unread = [*found.unread, *(name for name in _named(self.path) if not (self.path / name).is_file())]
         if not found.is_damaged and not unread and found.n_messages >= n_stated:
             return ""
         of_all = f" of {n_stated:,}" if n_stated else ""
         text = f"{found.n_messages:,}{of_all} messages in {(found.last - first) / 1e9:.1f} s are intact"
         if found.gaps:
-            longest = max(found.gaps, key=lambda gap: gap[1] - gap[0])
+            missing = sum(end - begin for begin, end in found.gaps) / NANOSECONDS
+            begin, end = max(found.gaps, key=lambda gap: gap[1] - gap[0])
             text += (
-                f"; {found.missing_seconds:.1f} s are missing, the longest gap from "
-                f"{(longest[0] - first) / 1e9:.1f} to {(longest[1] - first) / 1e9:.1f} s"
+                f"; {missing:.1f} s are missing, the longest gap from "
+                f"{(begin - first) / 1e9:.1f} to {(end - first) / 1e9:.1f} s"
             )
         if unread:
             text += f"; nothing can be read of {', '.join(unread)}"
-        if end:
-            missing = max(0, end - found.last) / NANOSECONDS
+        if last:
+            missing = max(0, last - found.last) / NANOSECONDS
             return text + f"; {missing:.1f} s at the end are missing" * (missing >= _LEAST_MISSING)
         return text + "; the file is cut off there, and does not state how much is missing" * found.is_cut
 

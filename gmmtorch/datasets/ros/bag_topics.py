@@ -28,8 +28,7 @@ INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 IMU_TYPE = "sensor_msgs/msg/Imu"
 _LISTS = {"sensor_msgs/msg/PointCloud": "points"}
 _IMAGE, _COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_REALSENSE = re.compile(r"/device_\d+/sensor_\d+(?=/)")
-"""The name of a sensor in the files of librealsense."""
+_REALSENSE = re.compile(r"/device_\d+/sensor_\d+(?=/)")  # the name of a sensor in the files of librealsense
 _DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 
 CLOUD, LIST, PACKETS, LASER, ECHOES, DEPTH, COMPRESSED = (
@@ -121,26 +120,16 @@ def _sensor(reader: BagReader, topic: Topic) -> Sensor | None:
     if topic.type in SINGLE_PACKETS:  # also of the IMU in the lidar
         return Sensor(topic, PACKETS) if next(reader.messages([topic.name]), None) else None
     if not topic.type.startswith(("sensor_msgs/", "std_msgs/", "geometry_msgs/", "nav_msgs/")):
-        fields = reader.fields(topic.type)
-        if fields and fields[0][1] == (NAME, "std_msgs/msg/Header"):
-            for name, desc in fields:
-                if _is_list_of_points(reader, desc):
-                    return Sensor(topic, LIST, name)
-                if name == "packets" and _is_list_of_packets(reader, desc):
-                    return Sensor(topic, PACKETS) if _is_of_known_lidar(reader, topic) else None
+        for name, desc in reader.fields(topic.type) if _has_header(reader, topic.type) else ():
+            inner = _fields_in_list(reader, desc)
+            are_numbers = all(kind == BASE and content[0] != "string" for kind, content in inner.values())
+            if are_numbers and {"x", "y", "z"} <= inner.keys():
+                return Sensor(topic, LIST, name)
+            kind, content = inner.get("data", (BASE, ("string", 0)))
+            are_bytes = kind in (ARRAY, SEQUENCE) and content[0] == (BASE, ("uint8", 0))
+            if name == "packets" and "stamp" in inner and are_bytes:
+                return Sensor(topic, PACKETS) if _is_of_known_lidar(reader, topic) else None
     return None
-
-
-def _is_list_of_points(reader: BagReader, desc: Any) -> bool:
-    fields = _fields_in_list(reader, desc)
-    numbers = all(inner[0] == BASE and inner[1][0] != "string" for inner in fields.values())
-    return numbers and {"x", "y", "z"} <= fields.keys()
-
-
-def _is_list_of_packets(reader: BagReader, desc: Any) -> bool:
-    fields = _fields_in_list(reader, desc)
-    kind, content = fields.get("data", (BASE, ("string", 0)))
-    return "stamp" in fields and kind in (ARRAY, SEQUENCE) and content[0] == (BASE, ("uint8", 0))
 
 
 def _is_of_known_lidar(reader: BagReader, topic: Topic) -> bool:
@@ -157,6 +146,10 @@ def _fields_in_list(reader: BagReader, desc: Any) -> dict[str, Any]:
     """The fields of the messages in a list; empty if a field is none."""
     is_list = desc[0] == SEQUENCE and desc[1][0][0] == NAME
     return dict(reader.fields(desc[1][0][1])) if is_list else {}
+
+
+def _has_header(reader: BagReader, message_type: str) -> bool:
+    return [kind for _, kind in reader.fields(message_type)[:1]] == [(NAME, "std_msgs/msg/Header")]
 
 
 def _camera(reader: BagReader, topic: Topic) -> Sensor | None:
@@ -291,21 +284,13 @@ def _stamp_place(reader: BagReader, topic: str, message_type: str) -> int | None
         return None
     if message_type in TF_TYPES:
         return _TF_STAMP
-    fields = reader.fields(message_type)
-    return _HEADER_STAMP if fields and fields[0][1] == (NAME, "std_msgs/msg/Header") else None
+    return _HEADER_STAMP if _has_header(reader, message_type) else None
 
 
 def _uses(reader: BagReader) -> dict[Topic, str]:
+    """What each topic with messages is for."""
+    uses = {**dict.fromkeys(TF_TYPES, "poses (TF)"), **dict.fromkeys(POSE_TYPES, "poses, if ‹poses›={}")}
+    uses |= {IMU_TYPE: "turns, if ‹motion›=imu", INFO_TYPE: "camera of depth images"}
     found = {sensor.topic: f"scans ({sensor.kind})" for sensor in sensors(reader)}
-    for topic in reader.topics:
-        if not topic.n_messages:
-            found[topic] = ""
-        elif topic.type in TF_TYPES:
-            found[topic] = "poses (TF)"
-        elif topic.type in POSE_TYPES:
-            found[topic] = f"poses, if ‹poses›={topic.name}"
-        elif topic.type == IMU_TYPE:
-            found[topic] = "turns, if ‹motion›=imu"
-        elif topic.type == INFO_TYPE:
-            found[topic] = "camera of depth images"
-    return found
+    known = [topic for topic in reader.topics if topic.n_messages and topic.type in uses]
+    return {**found, **{topic: uses[topic.type].format(topic.name) for topic in known}}

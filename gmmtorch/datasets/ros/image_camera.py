@@ -23,8 +23,7 @@ from gmmtorch.pinhole import back_project, check_intrinsics, is_centered, pinhol
 _RECTIFIED = re.compile(r"(^|[/_])(rect(ified)?(?![a-z])|aligned_depth)", re.IGNORECASE)
 """Names of rectified images, such as image_rect_raw. RealSense projects aligned depth images with P."""
 _REMEDY = "State the images' own: ‹intrinsics›=[fx,fy,cx,cy] in pixels, without distortion"
-_PLAUSIBLE = (0.05, 200.0)
-"""Medians of depth images in metres."""
+_PLAUSIBLE = (0.05, 200.0)  # medians of depth images in metres
 _N_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 _ITERATIONS = 30
 _STEP = 1e-6  # of differences; in units of the focal length
@@ -102,8 +101,7 @@ class ImageCamera:
 
     def points(self, message: dict[str, Any]) -> np.ndarray:
         """Points (N, 3) of a decoded image, camera frame, metres. Raises `DataError`."""
-        depth = self._depth(message)
-        model = self._model_of(depth)
+        depth, model = self._read(message)
         if model.rays is None:
             return back_project(depth, model.intrinsics, self._stride).numpy()
         rays, kept = (x[:: self._stride, :: self._stride] for x in (model.rays, depth))
@@ -114,15 +112,14 @@ class ImageCamera:
 
         An image with lens distortion is resampled to `intrinsics`: each pixel has the depth of the nearest.
         """
-        depth = self._depth(message)
-        model = self._model_of(depth)
+        depth, model = self._read(message)
         return depth if model.raw is None else torch.cat([depth.flatten(), depth.new_zeros(1)])[model.raw]
 
-    def _depth(self, message: dict[str, Any]) -> Tensor:
-        if self._sensor.kind == DEPTH:
-            depth = sensor_messages.depth_image(message, self._scale)
-        else:
-            depth = sensor_messages.compressed_depth_image(message, self._scale)
+    def _read(self, message: dict[str, Any]) -> tuple[Tensor, _Model]:
+        """The depth (H, W) of an image, and its camera."""
+        is_raw = self._sensor.kind == DEPTH
+        read = sensor_messages.depth_image if is_raw else sensor_messages.compressed_depth_image
+        depth = read(message, self._scale)
         if not self._has_depth and bool((depth > 0).any()):
             self._has_depth = True
             median = float(depth[depth > 0].median())
@@ -133,13 +130,10 @@ class ImageCamera:
                     self._sensor.topic.name,
                     median,
                 )
-        return depth
-
-    def _model_of(self, depth: Tensor) -> _Model:
         shape = tuple(depth.shape)
         if self._model is None or self._model.shape != shape:
             self._model = self._made(shape)
-        return self._model
+        return depth, self._model
 
     def _made(self, shape: tuple[int, ...]) -> _Model:
         if self._given is not None:

@@ -25,26 +25,16 @@ _LONGEST_TURN = 150_000_000
 """Scans further apart (ns) may be thinned out, so that their rate does not state how long a sweep is."""
 _SHARES = (0.25, 0.8)
 """Numbers up to 1 with a range below the first are seconds, those above the second shares of a sweep."""
-_NEAR = NANOSECONDS
-"""Times of points within this of the stamp (ns) are of its clock."""
-_SLACK = 1.05
-"""Sweeps of a sensor differ by less than this factor."""
-_ALIKE = 1.3
-"""Messages whose times spread more than this over the usual have a wrong one."""
-_CONTINUOUS = 0.75
-"""A sweep of this share of the time between scans, or more, may last until the next scan."""
-_OVERLAP = 1.3
-"""Longest sweep as a multiple of the time between scans."""
-_MOST_WRONG = 0.1
-"""If a larger share of the points has wrong times, all times are doubtful."""
-_FEWEST_STEPS = 20
-"""Fewest steps of a float32 in a sweep: absolute times in float32 have steps of 128 s."""
-_SMALL = 1e5
-"""Times below it, in any unit, are not those of a calendar."""
-_MOST_SAMPLED = 8192
-"""Points of a message that show how long its sweep is."""
-_FEW = 20
-"""Fewer points do not show that their times increase."""
+_NEAR = NANOSECONDS  # times of points within this of the stamp (ns) are of its clock
+_SLACK = 1.05  # sweeps of a sensor differ by less than this factor
+_ALIKE = 1.3  # messages whose times spread more than this over the usual have a wrong one
+_CONTINUOUS = 0.75  # a sweep of this share of the time between scans, or more, may last until the next scan
+_OVERLAP = 1.3  # longest sweep as a multiple of the time between scans
+_MOST_WRONG = 0.1  # if a larger share of the points has wrong times, all times are doubtful
+_FEWEST_STEPS = 20  # fewest steps of a float32 in a sweep: absolute times in float32 have steps of 128 s
+_SMALL = 1e5  # times below it, in any unit, are not those of a calendar
+_MOST_SAMPLED = 8192  # points of a message that show how long its sweep is
+_FEW = 20  # fewer points do not show that their times increase
 _CONSTANT = "their times do not vary"
 _CONTRADICTION = "their times contradict the rate of the scans"
 _NO_UNIT = "the unit of their times is not clear"
@@ -97,7 +87,7 @@ class PointTimes:
         sample = _sample(values, stamp)
         if sample is not None:
             self._samples.append(sample)
-            self._rule = _laser_rule(self._samples, rate) if self._is_laser else _rule(self._samples, rate)
+            self._rule = (_laser_rule if self._is_laser else _rule)(self._samples, rate)
 
     def offsets(self, values: np.ndarray, stamp: int) -> tuple[np.ndarray, np.ndarray | None]:
         """When the points of a message with times (N,) in its own form were measured.

@@ -159,7 +159,11 @@ class RosBag(Dataset):
             kept = survey.of_frame(records, sensor_frame, self._where)
             self._skip("message of another frame", *({r.number for r in records} - {r.number for r in kept}))
             records = kept
-        records = self._ordered(records)
+        # The longest series of messages whose stamps do not run backwards.
+        kept = [records[i] for i in increasing(np.array([record.stamp for record in records])).tolist()]
+        left_out = {record.number for record in records} - {record.number for record in kept}
+        self._skip("stamp out of order (the clock jumped)", *left_out)
+        records = kept
         self._source = survey.source(records, self._where, sensor_frame)
         self._conversion = ScanConversion(sensor, ranges, self._source, deskew, camera, attributes, packets)
         self._records, self._in_space = self._posed(records)
@@ -190,13 +194,6 @@ class RosBag(Dataset):
         if not records:
             raise DataError(f"{self._where}: none of {len(messages)} messages can be decoded; it is damaged.")
         return records
-
-    def _ordered(self, records: list[Record]) -> list[Record]:
-        """The longest series of messages whose stamps do not run backwards."""
-        kept = [records[i] for i in increasing(np.array([record.stamp for record in records])).tolist()]
-        left_out = {record.number for record in records} - {record.number for record in kept}
-        self._skip("stamp out of order (the clock jumped)", *left_out)
-        return kept
 
     def _posed(self, records: list[Record]) -> tuple[list[Record], Pose]:
         """The messages whose pose is known, and their poses in space (N)."""
@@ -372,8 +369,7 @@ class SeveralSensors(Dataset):
 IMU_GAP = 0.2
 """Longest time (s) between two messages over which rates are interpolated. If the rate changes by 10 rad/s²,
 the turn over such a gap is wrong by at most 3°."""
-_FASTEST = 100.0
-"""Largest rate (rad/s) that a gyroscope of a robot measures."""
+_FASTEST = 100.0  # largest rate (rad/s) that a gyroscope of a robot measures
 
 
 @dataclass(frozen=True)

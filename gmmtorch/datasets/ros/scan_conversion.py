@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gmmtorch.datasets.base import Ranges
 from gmmtorch.datasets.packets.lidar_packets import LidarPackets
@@ -24,12 +23,9 @@ from gmmtorch.pose import Pose
 from gmmtorch.scan import FARTHEST, Scan
 
 _LEVEL = math.cos(math.radians(10))
-_MIN_PLANAR = 16
-"""Fewer points at one height do not show that a cloud is the scan of a laser."""
-_N_SHAPES = 3
-"""Readings that show whether a lidar is planar."""
-_KNOTS = 1024
-"""Poses per sweep for deskewing: of a sweep of 0.1 s, one for every 0.1 ms."""
+_MIN_PLANAR = 16  # fewer points at one height do not show that a cloud is the scan of a laser
+_N_SHAPES = 3  # readings that show whether a lidar is planar
+_KNOTS = 1024  # poses per sweep for deskewing: of a sweep of 0.1 s, one for every 0.1 ms
 
 
 class ScanConversion:
@@ -68,16 +64,15 @@ class ScanConversion:
     def points(self, message: dict[str, Any]) -> Reading:
         """The points of a decoded message, in the sensor's frame."""
         kind = self._sensor.kind
+        if self._camera is not None and self._sensor.is_camera:
+            return sensor_messages.reading(self._camera.points(message))
         if kind == bag_topics.CLOUD:
             return sensor_messages.cloud_points(message, self._attributes)
         if kind == bag_topics.LIST:
             return sensor_messages.listed_points(message, self._sensor.field)
-        if kind in bag_topics.LASERS:
-            return sensor_messages.laser_points(message)
         if kind == bag_topics.PACKETS:
             return self._packets.points(message, self._attributes)
-        assert self._camera is not None
-        return sensor_messages.reading(self._camera.points(message), None, None)
+        return sensor_messages.laser_points(message)
 
     @property
     def n_samples(self) -> int:
@@ -105,13 +100,7 @@ class ScanConversion:
         return bool((poses.rotation[..., 2, 2].abs() > _LEVEL).all())
 
     def scan(
-        self,
-        found: Reading,
-        stamp: int,
-        frame: str,
-        pose: Pose,
-        is_flat: bool,
-        skip: Callable[[str], None],
+        self, found: Reading, stamp: int, frame: str, pose: Pose, is_flat: bool, skip: Callable[[str], None]
     ) -> Scan:
         """The scan of some points, in the world frame.
 
@@ -133,7 +122,9 @@ class ScanConversion:
         found, offsets = self._timed(found, stamp, skip)
         if isinstance(self.source, RegisteredPoses):
             pose = self.source.of_points(stamp, frame)
-        ends = self._in_world(found.points, offsets, stamp, frame, pose, skip)
+        poses = None if offsets is None else self._poses_during(stamp, offsets, frame, skip)
+        local = torch.from_numpy(found.points)
+        ends = pose.apply(local) if poses is None else poses.apply(local[:, None])[:, 0]
         ends[(ends.abs() > FARTHEST).any(1)] = torch.nan  # no sensor measures them
         ends, no_return = ends[:, :dim].contiguous(), torch.from_numpy(found.no_return)
         channels = found.channels
@@ -171,27 +162,21 @@ class ScanConversion:
         skip("points dropped: their times do not fit into the sweep")
         return found.where(kept), offsets
 
-    def _in_world(
-        self,
-        points: np.ndarray,
-        offsets: np.ndarray | None,
-        stamp: int,
-        frame: str,
-        pose: Pose,
-        skip: Callable[[str], None],
-    ) -> Tensor:
-        """Points (N, 3) in the world frame, each with the pose of its own time (N,) if that is known."""
-        local = torch.from_numpy(points)
-        if offsets is not None and self.source.can_deskew:
-            first, last = int(offsets.min()), int(offsets.max())
-            n_knots = min(_KNOTS, len(points)) if last > first else 1
-            knots = np.linspace(first, last, n_knots).round().astype(np.int64)
-            poses = self.source.at(stamp + knots, frame)
-            if poses.known.all():
-                nearest = np.round((offsets - first) * ((n_knots - 1) / max(last - first, 1)))
-                return poses.poses[nearest.astype(np.int64)].apply(local[:, None])[:, 0]
+    def _poses_during(
+        self, stamp: int, offsets: np.ndarray, frame: str, skip: Callable[[str], None]
+    ) -> Pose | None:
+        """The poses (N) of the sensor at times (N,) in ns after a stamp; None if they are not known."""
+        if not self.source.can_deskew:
+            return None
+        first, last = int(offsets.min()), int(offsets.max())
+        n_knots = min(_KNOTS, len(offsets)) if last > first else 1
+        knots = np.linspace(first, last, n_knots).round().astype(np.int64)
+        poses = self.source.at(stamp + knots, frame)
+        if not poses.known.all():
             skip("points not deskewed: no poses during the sweep")
-        return pose.apply(local)
+            return None
+        nearest = np.round((offsets - first) * ((n_knots - 1) / max(last - first, 1)))
+        return poses.poses[nearest.astype(np.int64)]
 
 
 def is_planar(found: Reading) -> bool:

@@ -56,8 +56,8 @@ class Reading(NamedTuple):
 
 def reading(
     points: np.ndarray,
-    no_return: np.ndarray | None,
-    times: np.ndarray | None,
+    no_return: np.ndarray | None = None,
+    times: np.ndarray | None = None,
     channels: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> Reading:
     """The valid ones of some points: finite, and not at the sensor."""
@@ -72,7 +72,7 @@ def cloud_points(message: dict[str, Any], wanted: Sequence[str] = ()) -> Reading
     width, height, step = int(message["width"]), int(message["height"]), int(message["point_step"])
     data = message["data"]
     if width * height == 0:
-        return reading(np.empty((0, 3)), None, None)
+        return reading(np.empty((0, 3)))
     row = _row_bytes((height, width), step, int(message["row_step"]), _ALIGNMENT, len(data))
     _check_fields(message["fields"])
     order = ">" if message["is_bigendian"] else "<"
@@ -146,7 +146,7 @@ def listed_points(message: dict[str, Any], field: str) -> Reading:
     """The points of a message with a list of points in `field`, such as Livox's CustomMsg."""
     table = message[field]
     if len(table) == 0:
-        return reading(np.empty((0, 3)), None, None)
+        return reading(np.empty((0, 3)))
     return _table_points(table, _time_field(table.dtype.names))
 
 

@@ -13,8 +13,7 @@ from gmmtorch.datasets.trajectory import NANOSECONDS, PosesAt, Trajectory
 from gmmtorch.errors import DataError
 from gmmtorch.pose import MIN_NORM, Pose
 
-_TRAVEL = 0.1
-"""A frame travels if it moves farther, in metres; noise and the joints of wheels do not."""
+_TRAVEL = 0.1  # a frame travels if it moves farther, in metres; noise and the joints of wheels do not
 
 
 class TransformTree:

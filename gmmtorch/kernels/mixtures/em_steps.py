@@ -30,8 +30,7 @@ _FEW_ROWS = 2048  # in fewer rows, their order matters little
 _FEW_COMPONENTS, _FEW_PAIRS = 64, 1 << 18
 """For fewer components, or fewer pairs of a row and a component, a CPU does not search for the near ones."""
 _PARTS = 64  # most parts of the rows; each has its own sums, so that threads write apart
-_SQUADS = 1056
-"""Most squads of a GPU, eight on each multiprocessor of a large one; each has its own sums."""
+_SQUADS = 1056  # most squads of a GPU, eight on each multiprocessor of a large one; each has its own sums
 _SQUAD_SUMS = 1 << 24  # most numbers of these sums, 128 MB
 
 _WIDTHS = {1: 3, 2: 6, 3: 10}

@@ -19,8 +19,7 @@ from gmmtorch.kernels.chunks import chunked
 from gmmtorch.kernels.compiler import CPU_LANES, FusedKernel
 from gmmtorch.linalg import order_along_curve
 
-_WINDOW = 2
-"""Neighbours, in each direction along the curve, among which a box looks for its partner."""
+_WINDOW = 2  # neighbours, in each direction along the curve, among which a box looks for its partner
 _SLOWEST = 1 / 6
 """If fewer boxes find a partner in a round, all neighbours join: a tree of 2³¹ triangles is at most 118 deep,
 within `DEEPEST` of triangles.h."""

@@ -178,8 +178,7 @@ cell above it, like its points under `floor`."""
 _HALF = 0.5 - _NUDGE / 2
 """Half a cell, reduced so that a face which only touches an edge or a corner of a cell does not count."""
 
-_CHUNK = 1 << 16
-"""Columns processed in one pass."""
+_CHUNK = 1 << 16  # columns processed in one pass
 
 
 def occupied_cells(triangles: Tensor, resolution: float, box: Box) -> Tensor:
