@@ -32,7 +32,7 @@ _NO_CHECKSUM = "00000000"  # stands for the checksum while it is computed
 _BEFORE_CHECKSUM = rb'"{\"crc32\":\"'  # the first bytes of our entry in the header
 
 
-def write_atomically(path: str | Path, write: Callable[[Path], None]) -> Path:
+def write_atomically(path: str | Path, write: Callable[[Path], object]) -> Path:
     """Call `write` with a temporary file in the folder of `path`, then rename that file to `path`.
 
     On any failure the temporary file is removed and `path` stays as it was. The temporary file has the
@@ -99,11 +99,7 @@ def check_writable(folder: Path) -> None:
 
 def write_bytes(path: str | Path, data: bytes) -> Path:
     """Write bytes atomically."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(data)
-
-    return write_atomically(path, write)
+    return write_atomically(path, lambda temporary: temporary.write_bytes(data))
 
 
 class FileLock:
@@ -275,19 +271,17 @@ def split_tensors(value: Any) -> tuple[Any, dict[str, Tensor]]:
     `value` is made of dicts, lists, tuples and JSON values. `joined_tensors` is the inverse.
     """
     tensors: dict[str, Tensor] = {}
-    return _replace_tensors(value, tensors), tensors
 
+    def replaced(part: Any) -> Any:
+        if isinstance(part, Tensor):
+            name = str(len(tensors))
+            tensors[name] = part.detach().cpu().contiguous().clone()
+            return {_TENSOR: name}
+        if isinstance(part, dict):
+            return {str(key): replaced(item) for key, item in part.items()}
+        return [replaced(item) for item in part] if isinstance(part, list | tuple) else part
 
-def _replace_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
-    if isinstance(value, Tensor):
-        name = str(len(tensors))
-        tensors[name] = value.detach().cpu().contiguous().clone()
-        return {_TENSOR: name}
-    if isinstance(value, dict):
-        return {str(key): _replace_tensors(item, tensors) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_replace_tensors(item, tensors) for item in value]
-    return value
+    return replaced(value), tensors
 
 
 def joined_tensors(tree: Any, tensors: Mapping[str, Tensor]) -> Any:

@@ -32,7 +32,7 @@ def use_kernels(choice: str) -> None:
     if choice == "fused":
         import torch
 
-        _require_compiler(torch.device("cpu"))
+        _compiler_works(torch.device("cpu"), is_needed=True)
     _chosen[:] = [choice]
 
 
@@ -80,10 +80,7 @@ def is_fused(*tensors: Tensor | None) -> bool:
         device = tensor.device
     if device is None or device.type not in ("cpu", "cuda"):
         return False
-    if choice == "fused":
-        _require_compiler(device)
-        return True
-    return _compiler_works(device)
+    return _compiler_works(device, choice == "fused")
 
 
 def _check(choice: str, name: str) -> None:
@@ -91,21 +88,15 @@ def _check(choice: str, name: str) -> None:
         raise InvalidArgumentError(f"{name}={choice!r} is not one of {', '.join(KERNELS)}.")
 
 
-def _require_compiler(device: torch.device) -> None:
+def _compiler_works(device: torch.device, is_needed: bool = False) -> bool:
     from gmmtorch.kernels.compiler import compiler_failure
 
     failure = compiler_failure(device)
-    if failure is not None:
+    if failure is not None and is_needed:
         raise GmmTorchError(
             f"kernels=fused needs the kernel compiler, but {failure}; install it with "
             "pip install 'gmmtorch[fast]', or choose ‹kernels›=auto or ‹kernels›=torch."
         )
-
-
-def _compiler_works(device: torch.device) -> bool:
-    from gmmtorch.kernels.compiler import compiler_failure
-
-    failure = compiler_failure(device)
     if failure is not None and failure not in _reported:
         _reported.add(failure)
         logger.info("Tensor operations replace fused kernels, because %s.", failure)

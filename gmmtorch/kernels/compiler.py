@@ -185,20 +185,19 @@ class FusedKernel:
                 argument = torch.from_numpy(argument)
             if isinstance(argument, Tensor):
                 if not argument.is_contiguous():
-                    argument = self._copied(self._parameters[len(values)], argument)
+                    parameter = self._parameters[len(values)]
+                    if not parameter.cpp.startswith("const "):
+                        raise GmmTorchError(
+                            f"{parameter.label} of kernel {self.name} has shape {tuple(argument.shape)} and "
+                            f"strides {argument.stride()}, which are not contiguous; pass "
+                            "tensor.contiguous()."
+                        )
+                    argument = argument.contiguous()
                 tensors.append(argument)
                 values.append(argument.data_ptr())
             else:
                 values.append(0 if argument is None else argument)
         return values, tensors
-
-    def _copied(self, parameter: _Parameter, tensor: Tensor) -> Tensor:
-        if parameter.cpp.startswith("const "):
-            return tensor.contiguous()
-        raise GmmTorchError(
-            f"{parameter.label} of kernel {self.name} has shape {tuple(tensor.shape)} and strides "
-            f"{tensor.stride()}, which are not contiguous; pass tensor.contiguous()."
-        )
 
     def load(self, device: torch.device) -> None:
         """Compile the kernel for a device, or load it from the cache; nothing if that is done.
@@ -449,14 +448,10 @@ def _cache_folder(preferred: Path | None) -> Path:
         except OSError:
             continue
     logger.info("Compiled kernels are not kept, because no cache folder can be written.")
-    return _temporary_folder()
+    return Path(_temporary_folder().name)
 
 
 @functools.cache
-def _temporary_folder() -> Path:
-    folder = tempfile.TemporaryDirectory(prefix="gmmtorch-kernels-")
-    _kept.append(folder)
-    return Path(folder.name)
-
-
-_kept: list[object] = []  # removed when the process ends
+def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    """A folder that is removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="gmmtorch-kernels-")

@@ -170,12 +170,8 @@ def building_2d(generator: torch.Generator) -> World2D:
         polygons += furnish(room, path, generator, {_shelf: 4, _table: 2, _desk: 2, _bin: 3})
     polygons += furnish(_HALL, path, generator, {_pillar: 6, _shelf: 4, _table: 4, _desk: 2, _bin: 4})
     polygons += furnish(_CORRIDOR, path, generator, {_cabinet: 5})
-    return World2D(torch.cat([_sides(polygon) for polygon in polygons]), path)
-
-
-def _sides(polygon: Tensor) -> Tensor:
-    """Segments (C, 2, 2) around a polygon (C, 2)."""
-    return torch.stack([polygon, polygon.roll(-1, dims=0)], 1)
+    sides = [torch.stack([polygon, polygon.roll(-1, dims=0)], 1) for polygon in polygons]
+    return World2D(torch.cat(sides), path)
 
 
 def _walls() -> list[Tensor]:
@@ -288,22 +284,15 @@ def building_3d(generator: torch.Generator) -> World3D:
     in_hall: dict[DrawPiece, int] = {pillar: 3, table: 2, shelf: 4, chair: 3, boxes: 2, globe: 1, barrel: 1}
     in_room: dict[DrawPiece, int] = {table: 1, shelf: 2, chair: 1, boxes: 2, barrel: 1}
     surfaces = [
-        *_floors_and_ceilings(),
+        box((-0.1, -0.1, -_THICKNESS), (14.1, 10.1, 0.0)),
+        box((-0.1, -0.1, CEILING), (14.1, 10.1, CEILING + _THICKNESS)),
+        box((14.1, 3.9, -_THICKNESS), (28.1, 6.1, 0.0)),
+        box((14.1, 3.9, _CORRIDOR_CEILING), (28.1, 6.1, _CORRIDOR_CEILING + _THICKNESS)),
         *_hall_walls(),
         *furnish(_HALL_3D, path, generator, in_hall),
         *furnish(_ROOM_3D, path, generator, in_room),
     ]
     return World3D(torch.cat(surfaces), path)
-
-
-def _floors_and_ceilings() -> list[Tensor]:
-    low, high = -_THICKNESS, CEILING + _THICKNESS
-    return [
-        box((-0.1, -0.1, low), (14.1, 10.1, 0.0)),
-        box((-0.1, -0.1, CEILING), (14.1, 10.1, high)),
-        box((14.1, 3.9, low), (28.1, 6.1, 0.0)),
-        box((14.1, 3.9, _CORRIDOR_CEILING), (28.1, 6.1, _CORRIDOR_CEILING + _THICKNESS)),
-    ]
 
 
 def _hall_walls() -> list[Tensor]:

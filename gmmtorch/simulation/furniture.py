@@ -146,9 +146,8 @@ def place(
 
     It stays `_CLEARANCE` metres away from the path (P, 2) and does not touch the `taken` footprints.
     """
-    draw = _at_wall if at_wall else _anywhere
     for _ in range(_ATTEMPTS):
-        footprint = draw(room, *size, generator)
+        footprint = _drawn(room, *size, at_wall, generator)
         corners = footprint.corners()
         inside = (corners >= torch.tensor(room[:2])) & (corners <= torch.tensor(room[2:]))
         if not bool(inside.all()) or bool(footprint.contains(path, _CLEARANCE).any()):
@@ -162,13 +161,12 @@ def place(
     return None
 
 
-def _anywhere(room: Room, length: float, width: float, generator: torch.Generator) -> Footprint:
-    x = uniform(room.x_min, room.x_max, generator)
-    y = uniform(room.y_min, room.y_max, generator)
-    return Footprint(x, y, uniform(0, math.pi, generator), length, width)
-
-
-def _at_wall(room: Room, length: float, width: float, generator: torch.Generator) -> Footprint:
+def _drawn(room: Room, length: float, width: float, at_wall: bool, generator: torch.Generator) -> Footprint:
+    """A footprint drawn anywhere in a room, or at one of its walls."""
+    if not at_wall:
+        x = uniform(room.x_min, room.x_max, generator)
+        y = uniform(room.y_min, room.y_max, generator)
+        return Footprint(x, y, uniform(0, math.pi, generator), length, width)
     offset = 0.02 + width / 2  # furniture stands 2 cm from the wall
     along_x = uniform(0, 1, generator) < 0.5
     near_side = uniform(0, 1, generator) < 0.5
@@ -348,15 +346,9 @@ class Bays(NamedTuple):
     fill: Tensor
 
 
-class _Cuboids(NamedTuple):
-    """Cuboids of bays: index of the bay (N,), centre relative to the bay (N, 3) and size (N, 3), metres.
-
-    The axes are along the row, across the row, and up.
-    """
-
-    bay: Tensor
-    offset: Tensor
-    size: Tensor
+_Cuboids = tuple[Tensor, Tensor, Tensor]
+"""Cuboids of bays: index of the bay (N,), centre relative to the bay (N, 3) and size (N, 3), metres; along
+the row, across the row, and up."""
 
 
 def racks(bays: Bays, along_y: bool, floor: float, generator: torch.Generator) -> Tensor:
@@ -381,17 +373,14 @@ def _frames(bays: Bays) -> _Cuboids:
     post, bay = _pairs(4, len(height))
     tall = height[bay]
     width = torch.full_like(tall, _UPRIGHT)
-    posts = _Cuboids(bay, torch.cat([feet[post], tall[:, None] / 2], 1), torch.stack([width, width, tall], 1))
+    posts = bay, torch.cat([feet[post], tall[:, None] / 2], 1), torch.stack([width, width, tall], 1)
     bar, bay = _pairs(10, len(height))
     above = 0.4 + 1.2 * (bar // 2)
-    along = (2.0 * (bar % 2) - 1) * reach[0]
-    bars = _Cuboids(
-        bay,
-        torch.stack([along, 0 * along, above.double()], 1),
-        torch.tensor([0.04, RACK_DEPTH - _UPRIGHT, 0.04], dtype=torch.float64).expand(len(bay), 3),
-    )
     within = above < height[bay]
-    return _joined(posts, _Cuboids(*(field[within] for field in bars)))
+    bar, bay, above = bar[within], bay[within], above[within]
+    along = (2.0 * (bar % 2) - 1) * reach[0]
+    size = torch.tensor([0.04, RACK_DEPTH - _UPRIGHT, 0.04], dtype=torch.float64).expand(len(bay), 3)
+    return _joined(posts, (bay, torch.stack([along, 0 * along, above.double()], 1), size))
 
 
 def _levels(bays: Bays, generator: torch.Generator) -> _Cuboids:
@@ -405,9 +394,9 @@ def _levels(bays: Bays, generator: torch.Generator) -> _Cuboids:
     decked = torch.rand(len(bay), generator=generator) < 0.85
     deck = torch.tensor([bays.width, RACK_DEPTH - 0.1, 0.03], dtype=torch.float64).expand(len(bay), 3)
     return _joined(
-        _Cuboids(bay, torch.stack([flat, edge, height - 0.06], 1), beam),
-        _Cuboids(bay, torch.stack([flat, -edge, height - 0.06], 1), beam),
-        _Cuboids(bay[decked], torch.stack([flat, flat, height - 0.015], 1)[decked], deck[decked]),
+        (bay, torch.stack([flat, edge, height - 0.06], 1), beam),
+        (bay, torch.stack([flat, -edge, height - 0.06], 1), beam),
+        (bay[decked], torch.stack([flat, flat, height - 0.015], 1)[decked], deck[decked]),
     )
 
 
@@ -422,18 +411,12 @@ def _goods(bays: Bays, generator: torch.Generator) -> _Cuboids:
     along = (slot - (_SLOTS - 1) / 2) * slot_width + 0.1 * (draw[1] - 0.5)
     across = 0.1 * (draw[2] - 0.5)
     base = level * bays.spacing[bay] + 0.01
-    load = torch.stack(
-        [
-            (0.55 + 0.35 * draw[3]) * slot_width,
-            0.6 + 0.35 * draw[4],
-            (0.25 + 0.75 * draw[5]) * (bays.spacing[bay] - _PALLET - _FREE_ABOVE - 0.12),
-        ],
-        1,
-    )
+    high = (0.25 + 0.75 * draw[5]) * (bays.spacing[bay] - _PALLET - _FREE_ABOVE - 0.12)
+    load = torch.stack([(0.55 + 0.35 * draw[3]) * slot_width, 0.6 + 0.35 * draw[4], high], 1)
     pallet = torch.tensor([0.85 * slot_width, 0.95, _PALLET], dtype=torch.float64).expand(len(bay), 3)
     return _joined(
-        _Cuboids(bay, torch.stack([along, across, base + _PALLET / 2], 1), pallet),
-        _Cuboids(bay, torch.stack([along, across, base + _PALLET + load[:, 2] / 2], 1), load),
+        (bay, torch.stack([along, across, base + _PALLET / 2], 1), pallet),
+        (bay, torch.stack([along, across, base + _PALLET + load[:, 2] / 2], 1), load),
     )
 
 
@@ -444,4 +427,5 @@ def _pairs(n: int, n_bays: int) -> tuple[Tensor, Tensor]:
 
 
 def _joined(*cuboids: _Cuboids) -> _Cuboids:
-    return _Cuboids(*(torch.cat(column) for column in zip(*cuboids, strict=True)))
+    bay, offset, size = map(torch.cat, zip(*cuboids, strict=True))
+    return bay, offset, size

@@ -164,13 +164,10 @@ class MeshWorld:
             return torch.empty(0, 3, dtype=torch.float64)
         found = torch.cat(places)
         found = found[self.clearance(found) >= min(clearance, height)]
-        return found[self._is_enclosed(found, sight)]
-
-    def _is_enclosed(self, points: Tensor, sight: float) -> Tensor:
         angle = torch.arange(16, dtype=torch.float64) * (2 * math.pi / 16)
         level = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
-        seen = self.distances(points.repeat(16, 1), level.repeat_interleave(len(points), 0)) < sight
-        return seen.view(16, -1).double().mean(0) >= _ENCLOSED
+        seen = self.distances(found.repeat(16, 1), level.repeat_interleave(len(found), 0)) < sight
+        return found[seen.view(16, -1).double().mean(0) >= _ENCLOSED]
 
     def tour(self, n: int, stride: int = 2, spacing: float = 1.0, **options: float) -> Tensor:
         """`n` places (n, 3) along a path through the largest connected part of the world.

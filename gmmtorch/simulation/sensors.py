@@ -27,7 +27,6 @@ class World(Protocol):
 
     def distances(self, origin: Tensor, directions: Tensor) -> Tensor:
         """Range (N,) in metres from the origin (D,) along unit directions (N, D); inf without a hit."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +80,8 @@ def spinning_lidar(
     check_whole("n_azimuths", n_azimuths, 1)
     elevation = torch.linspace(*elevations, n_rings, dtype=torch.float64)[:, None]
     azimuth = torch.arange(n_azimuths, dtype=torch.float64) * (2 * math.pi / n_azimuths)
-    directions = torch.stack(
-        [
-            elevation.cos() * azimuth.cos(),
-            elevation.cos() * azimuth.sin(),
-            elevation.sin().expand(n_rings, n_azimuths),
-        ],
-        -1,
-    )
+    level, up = elevation.cos(), elevation.sin().expand(n_rings, n_azimuths)
+    directions = torch.stack([level * azimuth.cos(), level * azimuth.sin(), up], -1)
     return RangeSensor(directions.flatten(0, 1), max_range, range_noise, dropout)
 
 
@@ -171,9 +164,8 @@ def smooth_path(waypoints: ArrayLike, spacing: float = 0.05) -> Tensor:
         cut = torch.stack([0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b], 1).flatten(0, 1)
         path = torch.cat([path[:1], cut[1:-1], path[-1:]])
     length = float(_arc_length(path)[-1])
-    return _point_at(
-        path, torch.linspace(0, length, max(2, math.ceil(length / spacing) + 1), dtype=path.dtype)
-    )
+    n_points = max(2, math.ceil(length / spacing) + 1)
+    return _point_at(path, torch.linspace(0, length, n_points, dtype=path.dtype))
 
 
 def poses_2d(path: ArrayLike, n: int) -> Tensor:

@@ -25,6 +25,7 @@ IMAGE_ODDS = 100.0
 """Factor on a cell's odds for Shannon information: dozens of pixels see a cell, not one beam."""
 
 _CHUNK_VIEWS = 16  # views that fit in a core's cache
+_KERNEL = FusedKernel("rays/beam_information.h", "information_by_block")
 
 
 class Beams(NamedTuple):
@@ -67,19 +68,8 @@ def information_by_block(
         yaw: (V,) int64, the headings.
         shannon_information: Shannon information (FSMI) instead of CSQMI.
     """
-    if is_fused(cells.occupancy, beams.volumes, cameras, yaw):
-        return _fused(beams, cells, cameras, yaw, shannon_information)
-    return _batched(beams, cells, cameras, yaw, shannon_information)
-
-
-# -- the fused kernel --------------------------------------------------------------------------------
-
-_KERNEL = FusedKernel("rays/beam_information.h", "information_by_block")
-
-
-def _fused(
-    beams: Beams, cells: Cells, cameras: Tensor, yaw: Tensor, shannon_information: bool
-) -> tuple[Tensor, Tensor]:
+    if not is_fused(cells.occupancy, beams.volumes, cameras, yaw):
+        return _batched(beams, cells, cameras, yaw, shannon_information)
     n_views, device = len(cameras), cameras.device
     n_templates, n_columns = beams.volumes.shape
     n_own = beams.per_view if device.type == "cpu" else 1
@@ -96,12 +86,10 @@ def _fused(
     return gain, taken
 
 
-# -- the twin ----------------------------------------------------------------------------------------
-
-
 def _batched(
     beams: Beams, cells: Cells, cameras: Tensor, yaw: Tensor, shannon_information: bool
 ) -> tuple[Tensor, Tensor]:
+    """The twin."""
     _, ny, nz = cells.shape
     template = yaw[:, None] * beams.per_view + torch.arange(beams.per_view, device=yaw.device)
     lengths = _lengths_within(beams, cells, cameras, template)
@@ -111,9 +99,8 @@ def _batched(
     taken = torch.empty_like(gain)
     for begin in range(0, len(cameras), _CHUNK_VIEWS):
         part = slice(begin, begin + _CHUNK_VIEWS)
-        gain[part], taken[part] = _few_views(
-            beams, cells, yaw[part], base[part], template[part], lengths[part], shannon_information
-        )
+        views = yaw[part], base[part], template[part], lengths[part]
+        gain[part], taken[part] = _few_views(beams, cells, *views, shannon_information)
     return gain, taken
 
 
@@ -133,13 +120,7 @@ def _lengths_within(beams: Beams, cells: Cells, cameras: Tensor, template: Tenso
 
 
 def _few_views(
-    beams: Beams,
-    cells: Cells,
-    yaw: Tensor,
-    base: Tensor,
-    template: Tensor,
-    lengths: Tensor,
-    shannon_information: bool,
+    beams: Beams, cells: Cells, yaw: Tensor, base: Tensor, template: Tensor, lengths: Tensor, by_shannon: bool
 ) -> tuple[Tensor, Tensor]:
     """Gain and resolved variance, (v, G) each, of a few views."""
     n_cells = len(cells.occupancy) - 1
@@ -158,7 +139,7 @@ def _few_views(
     if len(chosen) < len(cell):
         template, total = template[chosen], total[chosen]
         cell, occupancy, hit, resolved = (a.index_select(0, chosen) for a in (cell, occupancy, hit, resolved))
-    if shannon_information:
+    if by_shannon:
         information = shannon(hit, occupancy, IMAGE_ODDS, 1 / IMAGE_ODDS)
     else:
         kernel = beams.kernel.index_select(1, template)
@@ -179,9 +160,7 @@ def _few_views(
 
 
 def first_block(occupancy: Tensor) -> Tensor:
-    """Return the probability (..., C) that each cell is the first occupied one; the last must have
-    occupancy 1.
-    """
+    """The probability (..., C) that each cell is the first occupied one; the last must have occupancy 1."""
     return _reach(occupancy).mul_(occupancy)
 
 
@@ -232,9 +211,7 @@ def shannon(hit: Tensor, occupancy: Tensor, delta_occ: float = 1.5, delta_emp: f
 
 
 def _information_of(delta: float, occupancy: Tensor) -> Tensor:
-    """Return f(δ, r) = log((r + 1)/(r + 1/δ)) − log δ/(rδ + 1) in terms of o = r/(1 + r); finite at 0 and
-    1.
-    """
+    """f(δ, r) = log((r + 1)/(r + 1/δ)) − log δ/(rδ + 1) in terms of o = r/(1 + r); finite at 0 and 1."""
     clear = 1 - occupancy
     after = (occupancy + clear / delta).log_()
     return after.neg_().sub_(math.log(delta) * clear / (occupancy * delta + clear))

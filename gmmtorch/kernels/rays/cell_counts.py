@@ -118,15 +118,10 @@ def cell_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
         bits = blocks.local_bits, blocks.axis_bits
         _INDEX(-(-n // run), cells, n, dim, run, *table, *bits, index)
         return index
-    return _batched_index(cells, blocks)
-
-
-def _batched_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
-    origin, low, high = blocks.bounds.tolist()
-    columns = [cells[:, axis] - origin[axis] for axis in range(len(origin))]
+    bounds = list(zip(cells.unbind(1), *blocks.bounds.tolist(), strict=True))
+    columns = [cell - origin for cell, origin, _, _ in bounds]
     inside = functools.reduce(
-        torch.logical_and,
-        [(cells[:, axis] >= low[axis]) & (cells[:, axis] < high[axis]) for axis in range(len(origin))],
+        torch.logical_and, [(cell >= low) & (cell < high) for cell, _, low, high in bounds]
     )
     half, in_block = 1 << (blocks.axis_bits - 1), (1 << blocks.local_bits) - 1
     key, place = (columns[0] >> blocks.local_bits) + half, columns[0] & in_block
@@ -138,10 +133,8 @@ def _batched_index(cells: Tensor, blocks: BlockKeys) -> Tensor:
     # Neighbouring cells often share a block: each run of equal keys is searched once.
     runs, run = torch.unique_consecutive(torch.where(inside, key, -1), return_inverse=True)
     rank = torch.searchsorted(blocks.keys, runs).clamp_max(len(blocks.keys) - 1)
-    first = torch.where(
-        blocks.keys[rank] == runs, blocks.slots[rank] << (blocks.local_bits * len(origin)), -1
-    )
-    first = first[run]
+    place_bits = blocks.local_bits * len(columns)
+    first = torch.where(blocks.keys[rank] == runs, blocks.slots[rank] << place_bits, -1)[run]
     return torch.where(inside, torch.where(first < 0, -1, first + place), 0)
 
 

@@ -135,7 +135,10 @@ def share_beyond_2d(corners: Tensor, mean: Tensor, inside: Tensor, cutoff: float
     first = (direction + spread.amin(0)).clamp(-_QUARTER, _QUARTER)
     last = (direction + spread.amax(0)).clamp(-_QUARTER, _QUARTER)
     first, last = torch.where(inside, -_QUARTER, first), torch.where(inside, _QUARTER, last)
-    nearest = torch.where(inside, 0.0, _distance_to(corners))
+    edges = corners.roll(-1, 0) - corners
+    share = -dot(corners, edges) / dot(edges, edges).clamp_min(1e-300)
+    apart = length(corners + share.clamp(0, 1)[:, None] * edges).amin(0)
+    nearest = torch.where(inside, 0.0, apart)
     sideways = _erf((distance * last.sin()).clamp(-cutoff, cutoff)) - _erf(
         (distance * first.sin()).clamp(-cutoff, cutoff)
     )
@@ -151,13 +154,6 @@ def _erf(deviations: Tensor) -> Tensor:
 def _angle(a: Tensor, b: Tensor) -> Tensor:
     """Angle from a to b in (−π, π]: (…, 2, P) → (…, P)."""
     return torch.atan2(cross(a, b)[..., 0, :], dot(a, b))
-
-
-def _distance_to(corners: Tensor) -> Tensor:
-    """Distance (P,) from the sensor origin to a parallelogram that does not contain it."""
-    edges = corners.roll(-1, 0) - corners
-    share = -dot(corners, edges) / dot(edges, edges).clamp_min(1e-300)
-    return length(corners + share.clamp(0, 1)[:, None] * edges).amin(0)
 
 
 _EDGE_ON = 1e-3  # least distance, in deviations, of a component's plane from the sensor origin

@@ -188,35 +188,21 @@ def flux_evidence(
         for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
             add_row_flux(misses, table, counts, rows, axis, place, cutoff, limits)
         return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
-    for axis, rows in enumerate(face_rows(cones, grid, cutoff)):
-        misses = _add_faces(misses, white, counts, grid, axis, rows, how)
+    for axis, rows in enumerate(face_rows(cones, grid, cutoff)):  # the twin of `add_row_flux`
+        for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
+            cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
+            middle = cells.double() + 0.5
+            center = _world(grid, [*middle[:axis], plane.double(), *middle[axis:]])
+            side = center.new_full((grid.dim, 1), grid.resolution)
+            flux = _face_flux(white.take(cone), center, side, axis, forward, how)
+            left = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
+            misses = misses.index_add(0, row_major(left, grid.shape), flux * counts[cone])
     hits = torch.zeros_like(misses)
     for row, cell in cells_in_chunks(*balls[1:], CHUNK_FACES):
         cone, low = balls[0][row], _world(grid, cell.double())
         mass = box_mass(white.take(cone), low, low + grid.resolution, *how)
         hits = hits.index_add(0, row_major(cell.unbind(), grid.shape), mass * counts[cone])
     return Evidence(grid, hits.view(grid.shape), misses.view(grid.shape))
-
-
-def _add_faces(
-    misses: Tensor,
-    white: WhitenedCones,
-    counts: Tensor,
-    grid: VoxelGrid,
-    axis: int,
-    rows: FaceRows,
-    how: Rules,
-) -> Tensor:
-    """misses (cells,) and the flux through rows of faces; the twin of `kernels.add_row_flux`."""
-    for row, cells in cells_in_chunks(rows.first, rows.number, CHUNK_FACES):
-        cone, plane, forward = rows.cone[row], rows.plane[row], rows.forward[row]
-        middle = cells.double() + 0.5
-        center = _world(grid, [*middle[:axis], plane.double(), *middle[axis:]])
-        side = center.new_full((grid.dim, 1), grid.resolution)
-        flux = _face_flux(white.take(cone), center, side, axis, forward, how)
-        cell = [*cells[:axis], torch.where(forward, plane - 1, plane), *cells[axis:]]
-        misses = misses.index_add(0, row_major(cell, grid.shape), flux * counts[cone])
-    return misses
 
 
 def box_flux(

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from gmmtorch.errors import InvalidArgumentError
 from gmmtorch.kernels import chunked
+from gmmtorch.linalg import ragged_index
 from gmmtorch.occupancy.cones import CUTOFF, WhitenedCones, cross, dot, length, outside_ball
 
 TOLERANCE = 1e-4
@@ -212,8 +213,7 @@ def _cut_boxes(panels: _Panels, ratio: Tensor) -> _Panels:
     """Cut panels along each edge into ⌈ratio⌉ parts, at most 4; ratio (D−1, Q): variation over its limit."""
     for axis in range(len(ratio)):
         parts = ratio[axis].ceil().clamp(1, _MAX_SPLIT).long()
-        source = torch.repeat_interleave(parts)
-        rank = torch.arange(len(source), device=source.device) - (torch.cumsum(parts, 0) - parts)[source]
+        source, rank = ragged_index(parts)
         panels, ratio, parts = panels.take(source), ratio[:, source], parts[source]
         along = torch.arange(len(ratio), device=source.device)[:, None] == axis
         shift = panels.scale * ((rank + 0.5) / parts - 0.5)

@@ -58,7 +58,9 @@ def cast_evidence(
     weight = torch.ones_like(stops[:, 0])
     if weights is not None:
         weight = as_tensor(weights, "weights", torch.float64, stops.device)
-    misses = rays.count_rays(weight).view(block.shape)
+    misses = torch.zeros(block.shape, dtype=torch.float64, device=stops.device)
+    of_rays = weight if rays.ray is None else weight.index_select(0, rays.ray)
+    count_in_grid(misses.view(-1), rays.starts, rays.stops, block.shape, of_rays, rays.low)
     if block is not window:
         misses = misses[1:-1, 1:-1, 1:-1]
     if places is None or hit_places is None:
@@ -86,13 +88,6 @@ class RaysInBox(NamedTuple):
     stops: Tensor
     low: Tensor | None
     ray: Tensor | None
-
-    def count_rays(self, weights: Tensor) -> Tensor:
-        """The sum (cells,) float64 of the weights (R,) of the rays that leave each cell of the block."""
-        counts = torch.zeros(math.prod(self.block.shape), dtype=torch.float64, device=weights.device)
-        weights = weights if self.ray is None else weights.index_select(0, self.ray)
-        count_in_grid(counts, self.starts, self.stops, self.block.shape, weights, self.low)
-        return counts
 
 
 def rays_in_box(

@@ -103,9 +103,7 @@ class SparseLattice:
             )
 
     def block_keys(self, columns: list[Tensor]) -> Tensor:
-        """Keys (M,) of the blocks that contain the cells of `columns`, int64; ordered like block
-        coordinates.
-        """
+        """Keys (M,), int64, of the blocks of the cells of `columns`, in the order of block coordinates."""
         key = (columns[0] >> self.local_bits) + self._half
         for column in columns[1:]:
             key = (key << self._axis_bits) | ((column >> self.local_bits) + self._half)
@@ -317,8 +315,7 @@ class SparseEvidence(SparseLattice):
         if ends.shape[0] == 0:
             return
         count_misses(self, origins, ends, weights)
-        columns = self.columns(self.cells_of(ends).long())
-        index = self._first_of(self.block_keys(columns)) + self.places(columns)
+        index = self._index_of(self.cells_of(ends).long())
         source = torch.ones_like(index, dtype=torch.float64) if weights is None else weights
         if is_hit is not None:
             index, source = index[is_hit], source[is_hit]
@@ -368,18 +365,12 @@ class SparseEvidence(SparseLattice):
         """Flat index (C,) of cells (C, D) in the counts; −1 in blocks not stored, 0 outside the box."""
         anchor, box, bounds = self._bounds
         if bounds is None or anchor is not self.anchor or box is not self._box:
-            bounds = self._new_bounds()
+            low, reach = self.origin() * self.block_side, (self._half - 1) * self.block_side
+            ends = (low - reach, low + reach) if self._box is None else self._box
+            bounds = torch.stack([part.to(self.device) for part in (low, *ends)])
             self._bounds = self.anchor, self._box, bounds
         keys = BlockKeys(self.keys, self._slots, bounds, self.local_bits, self._axis_bits)
         return cell_index(cells, keys)
-
-    def _new_bounds(self) -> Tensor:
-        """The bounds of `BlockKeys`."""
-        low = self.origin() * self.block_side
-        if self._box is None:
-            reach = torch.full_like(low, (self._half - 1) * self.block_side)
-            return torch.stack([low, low - reach, low + reach]).to(self.device)
-        return torch.stack([low.to(self.device), *self._box])
 
     def _first_of(self, keys: Tensor) -> Tensor:
         """Flat index (M,) of the first cell of each block; 0 for blocks that are not stored."""
@@ -389,8 +380,7 @@ class SparseEvidence(SparseLattice):
         return torch.where(known, self._slots[rank] * self.cells_per_block, 0)
 
     def open_blocks(self, keys: Tensor) -> Tensor:
-        """Store the blocks with these distinct keys (M,); return the flat index of the first cell of each
-        (M,).
+        """Store the blocks with these distinct keys (M,); return the flat index (M,) of their first cells.
 
         Raises `MemoryLimitError` if the blocks exceed `memory_limit` bytes.
         """
@@ -462,10 +452,9 @@ class SparseEvidence(SparseLattice):
     # -- reading ----------------------------------------------------------------------------------
 
     def at_points(self, points: ArrayLike) -> tuple[Tensor, Tensor]:
-        """Hits (M,) and misses (M,) of the cells that contain points (M, D), world metres; 0 without
-        evidence.
+        """Hits (M,) and misses (M,) of the cells that contain points (M, D), world metres.
 
-        Points can be NaN or infinite: they have no evidence.
+        They are 0 without evidence, also at points that are NaN or infinite.
         """
         cells = self.cells_of(as_tensor(points, "points", device=self.device))
         reachable = self.reachable(self.columns(cells))
@@ -489,10 +478,8 @@ class SparseEvidence(SparseLattice):
             return hits, misses
         side, dim = self.block_side, self.dim
         first, last = box.low >> self.local_bits, box.high - 1 >> self.local_bits
-        axes = [
-            torch.arange(a, b + 1, device=self.device)
-            for a, b in zip(first.tolist(), last.tolist(), strict=True)
-        ]
+        ends = zip(first.tolist(), last.tolist(), strict=True)
+        axes = [torch.arange(a, b + 1, device=self.device) for a, b in ends]
         corners = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, dim) << self.local_bits
         columns = self.columns(corners)
         keys = torch.where(self.reachable(columns), self.block_keys(columns), -1)
