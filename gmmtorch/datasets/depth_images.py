@@ -137,13 +137,11 @@ class _DepthDataset(Dataset):
         return self.ranges.posed(points, pose, channels)
 
     def image(self, index: int) -> tuple[Tensor, Tensor]:
-        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan.
-
-        The rotation, which is rounded in files, is made orthonormal.
-        """
+        """Depth (H, W) in metres, 0 for invalid pixels, and pose (4, 4), world ← camera, of a scan."""
         position = self._position(index)
         pose = self._known_pose(position)
         assert pose is not None
+        # The rotation is rounded in files.
         return self._depth(position), Pose.from_matrix(pose).orthonormal().matrix
 
     @abstractmethod

@@ -118,9 +118,8 @@ def _parse(words: list[str], path: Path, number: int) -> Tensor:
         )
     if len(words) < 2 + n + 3:
         raise DataError(f"{where}: FLASER announces {n} beams, but the line ends early.")
-    record = torch.from_numpy(
-        number_rows([" ".join(words[2 : 2 + n + 3])], n + 3, f"{path}, line", number)[0]
-    )
+    numbers = number_rows([" ".join(words[2 : 2 + n + 3])], n + 3, f"{path}, line", number)
+    record = torch.from_numpy(numbers[0])
     if not bool(torch.isfinite(record[-3:]).all()):
         raise DataError(f"{where}: the pose {record[-3:].tolist()} is not finite.")
     return record
@@ -155,7 +154,8 @@ class OctomapLog(Dataset):
         super().__init__(self._path.name.split(".")[0], ranges, stride)
         self._unzipped = gunzip(self._path)
         with self._open() as file:
-            self._is_binary = _is_binary(file)
+            # A text log has no zero byte, the first counts of a graph have some.
+            self._is_binary = b"\0" in file.read(2 * _COUNT.size)
             file.seek(0)
             self._nodes = (_binary_nodes if self._is_binary else _node_positions)(file, str(self._path))
         if not self._nodes:
@@ -196,16 +196,11 @@ class OctomapLog(Dataset):
             file.seek(self._nodes[index])
             if self._is_binary:
                 return _read_pose(file, where)
-            head = file.readline(_LINE_BYTES).decode("ascii", errors="replace")
-        return _node_pose(head, where)
-
-
-def _node_pose(line: str, where: str) -> Tensor:
-    """The pose (4, 4) in a NODE line."""
-    numbers = number_rows([line.removeprefix("NODE")], 6, where + ", NODE line")[0]
-    if not np.isfinite(numbers).all():
-        raise DataError(f"{where}: the pose {numbers.tolist()} is not finite.")
-    return Pose(rotation(*numbers[3:]), torch.from_numpy(numbers[:3])).matrix
+            line = file.readline(_LINE_BYTES).decode("ascii", errors="replace")
+        numbers = number_rows([line.removeprefix("NODE")], 6, where + ", NODE line")[0]
+        if not np.isfinite(numbers).all():
+            raise DataError(f"{where}: the pose {numbers.tolist()} is not finite.")
+        return Pose(rotation(*numbers[3:]), torch.from_numpy(numbers[:3])).matrix
 
 
 def rotation(roll: float, pitch: float, yaw: float) -> Tensor:
@@ -227,17 +222,8 @@ def _node_positions(file: io.BufferedIOBase, where: str) -> list[int]:
 # -- binary graphs --------------------------------------------------------------------------------------
 
 
-def _is_binary(file: io.BufferedIOBase) -> bool:
-    """Whether the file is binary: a text log has no zero byte, the first counts of a graph have some."""
-    file.seek(0)
-    return b"\0" in file.read(2 * _COUNT.size)
-
-
 def _binary_nodes(file: io.BufferedIOBase, where: str) -> list[int]:
-    """Byte positions of the nodes in the file, whose sizes are all checked against its length.
-
-    Raises `DataError`, which begins with `where`, if the file is cut off or of another format.
-    """
+    """Byte positions of the nodes in the file, whose sizes are all checked against its length."""
     length = file.seek(0, io.SEEK_END)
     file.seek(0)
     positions = []

@@ -152,13 +152,10 @@ def _tum(path: Path, rows: np.ndarray) -> Trajectory:
 
 def order_of_rows(path: Path, times: np.ndarray) -> np.ndarray:
     """The order (N,) of the rows of a file by their times (N,). A warning states how many rows it moves."""
-    order = np.argsort(times, kind="stable")
-    n_moved = len(times) - len(increasing(times))
+    n_moved, n_rows = len(times) - len(increasing(times)), len(times)
     if n_moved:
-        _log.warning(
-            "%s: %d of %d rows are out of order; they are sorted by time.", path, n_moved, len(times)
-        )
-    return order
+        _log.warning("%s: %d of %d rows are out of order; they are sorted by time.", path, n_moved, n_rows)
+    return np.argsort(times, kind="stable")
 
 
 def to_nanoseconds(seconds: np.ndarray) -> np.ndarray:
@@ -269,9 +266,6 @@ class Reposed(Dataset):
         """The pose (D+1, D+1) that the source states for scan `index`, world ← sensor."""
         pose: Tensor = self._source.pose(self._indices[self._position(index)])
         return pose
-
-    def pose(self, index: int) -> Tensor:
-        return self._poses[self._position(index)]
 
     def _read(self, index: int) -> Scan:
         before = Pose.from_matrix(self._source.pose(self._indices[index]))

@@ -110,12 +110,9 @@ class Calibration(NamedTuple):
     @classmethod
     def of_bytes(cls, data: bytes) -> Calibration:
         """The calibration of `to_bytes`. Raises `DataError` for any other bytes."""
-        values = (
-            np.frombuffer(data, dtype="<f2").astype(np.float64)
-            if len(data) == N_BYTES
-            else np.full(14, np.nan)
-        )
-        if (np.abs(values) <= _LARGEST).all() and values[1] >= 0:  # NaN compares false
+        values = np.frombuffer(data[: len(data) // 2 * 2], dtype="<f2").astype(np.float64)
+        # NaN compares false.
+        if len(data) == N_BYTES and (np.abs(values) <= _LARGEST).all() and values[1] >= 0:
             length, n_predicted, *mean = values.tolist()
             made = cls(_short(math.exp(length)), tuple(mean), round(math.expm1(n_predicted)))
             if made.to_bytes() == data:

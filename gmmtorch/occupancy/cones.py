@@ -84,10 +84,8 @@ def former_rows(old: Cones, new: Cones) -> Tensor:
         torch.cat([part.detach().double().view(len(part), -1) for part in cones], 1) for cones in (old, new)
     ]
     mixer = torch.arange(1, tables[1].shape[1] + 1, device=new.means.device) * _MIXER
-    keys = []
-    for rows in tables:
-        bits = rows.view(torch.int64)
-        keys.append((((bits >> 29) ^ bits) * mixer).sum(1))
+    bits = [rows.view(torch.int64) for rows in tables]
+    keys = [((each >> 29 ^ each) * mixer).sum(1) for each in bits]
     order = keys[0].argsort(stable=True)
     if not n_old:
         return torch.full_like(keys[1], -1)
@@ -256,9 +254,7 @@ def face_rows(cones: Cones, grid: VoxelGrid, cutoff: float = CUTOFF) -> Iterator
         # Forward: planes 1 … n above the sensor origin, each the upper face of a cell; backward: 0 … n − 1.
         begin = torch.stack([sensor[:, axis].floor() + 1, below[:, axis].floor() + 1])
         stop = torch.stack([above[:, axis].ceil(), sensor[:, axis].ceil()])
-        begin, stop = (
-            torch.stack([ends[0].clamp(1, n + 1), ends[1].clamp(0, n)]).long() for ends in (begin, stop)
-        )
+        begin, stop = (torch.stack([a.clamp(1, n + 1), b.clamp(0, n)]).long() for a, b in (begin, stop))
         row, within = ragged_index((stop - begin).clamp_min(0).flatten())
         plane = within + begin.flatten()[row]
         cone, forward = row % len(sensor), row < len(sensor)

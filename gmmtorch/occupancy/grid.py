@@ -87,11 +87,8 @@ class VoxelGrid:
             as_tensor(value, name, torch.float64).flatten().tolist()
             for name, value in (("low", low), ("high", high))
         )
-        if (
-            len(low) != len(high)
-            or not all(math.isfinite(x) for x in (*low, *high))
-            or any(b < a for a, b in zip(low, high, strict=True))
-        ):
+        are_finite = len(low) == len(high) and all(math.isfinite(x) for x in (*low, *high))
+        if not are_finite or any(b < a for a, b in zip(low, high, strict=True)):
             raise InvalidArgumentError(f"low={low}, high={high} is not a box of finite metres.")
         first, shape = _covering_cells(low, high, resolution)
         n_bytes = math.prod(shape) * BYTES_PER_CELL

@@ -192,9 +192,6 @@ class TensorFileMap(BaselineMap):
         """Takes the state from the tensors of a file. Raises `DataError` if they are damaged."""
 
 
-# -- checks of options ------------------------------------------------------------------------------
-
-
 def check_length(name: str, value: float) -> float:
     """A length (m) as a float. Raises `InvalidArgumentError` unless it is finite and above zero."""
     if not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):

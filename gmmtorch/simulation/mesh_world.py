@@ -205,10 +205,8 @@ class MeshWorld:
 
 
 def _walk(graph: Any, n: int, reach: float) -> np.ndarray:
-    """Nodes (W,), W ≤ n, of a walk through the largest connected part of a graph.
-
-    It ends when every node of the part is within `reach` metres of a visited node.
-    """
+    """Nodes (W,), W ≤ n, of a walk through the largest connected part of a graph, to within `reach` metres of
+    all of its nodes."""
     from scipy.sparse.csgraph import connected_components, dijkstra
 
     _, label = connected_components(graph, directed=False)

@@ -125,10 +125,8 @@ def _directions(camera: DepthCamera, device: torch.device) -> Tensor:
 
 
 def _distance_to_spheres(centers: Tensor, radius: float, directions: Tensor) -> Tensor:
-    """Range (N,) in metres from the origin along directions (N, 3) to the nearest sphere.
-
-    `centers` (M, 3) are the centres of the spheres. Infinite without a hit; zero inside a sphere.
-    """
+    """Range (N,) in metres from the origin along directions (N, 3) to the nearest sphere, of centers (M, 3);
+    infinite without a hit, zero inside a sphere."""
     along = directions @ centers.T
     distance = centers.square().sum(1)
     # |t u − c|² = ρ² has the roots t = u·c ± √((u·c)² − |c|² + ρ²).

@@ -101,10 +101,7 @@ def _checked(path: Path) -> Path:
 
 
 def _velodyne_decoder() -> Callable[[list[tuple[float, bytes]]], np.ndarray]:
-    """A function that decodes (time in s, packet) of a sweep with the package velodyne-decoder.
-
-    The first packet states the model, except for the HDL-64E.
-    """
+    """A function that decodes (time in s, packet) of a sweep with the package velodyne-decoder."""
     with needs_extra("Velodyne packets need", "velodyne-decoder", "packets"):
         import velodyne_decoder
     decoder = velodyne_decoder.ScanDecoder(velodyne_decoder.Config())

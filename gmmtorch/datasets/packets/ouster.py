@@ -104,8 +104,7 @@ class Metadata(NamedTuple):
 
 def is_metadata(text: str | bytes) -> bool:
     """Whether a text looks like the metadata of an Ouster lidar."""
-    name = _NEEDED[0]
-    return (name in text) if isinstance(text, str) else (name.encode() in text)
+    return _NEEDED[0] in (text if isinstance(text, str) else text.decode("latin-1"))
 
 
 def read_metadata(text: str | bytes, where: str) -> Metadata:

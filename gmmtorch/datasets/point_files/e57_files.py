@@ -47,7 +47,7 @@ class E57Scans(Dataset):
             for matrix, header in zip(matrices, headers, strict=True):
                 if header.has_pose():
                     matrix[:3, :3], matrix[:3, 3] = header.rotation_matrix, header.translation
-        if not len(matrices):
+        if not headers:
             raise DataError(f"{path} contains no scan.")
         self._poses = check_poses(torch.from_numpy(matrices), f"{path}, pose of scan")
 

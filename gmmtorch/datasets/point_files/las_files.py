@@ -22,11 +22,7 @@ _MAX_CHUNK_POINTS = 1 << 22
 
 
 def _checked_header(path: Path) -> Any:
-    """The header of a LAS or LAZ file by laspy.
-
-    Raises `DataError` if the file is shorter than its header, its variable-length records, its chunk table or
-    its uncompressed points.
-    """
+    """The header of a LAS or LAZ file by laspy, whose sizes fit the file."""
     import laspy
 
     size = path.stat().st_size

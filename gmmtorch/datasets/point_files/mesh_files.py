@@ -270,14 +270,6 @@ def _fans(corners: np.ndarray, polygons: list[np.ndarray]) -> np.ndarray:
     return corners[whole]
 
 
-def _by_size(polygons: list[list[int]]) -> list[np.ndarray]:
-    """Polygons as one array (F, k) for each number k of corners."""
-    found: dict[int, list[list[int]]] = {}
-    for polygon in polygons:
-        found.setdefault(len(polygon), []).append(polygon)
-    return [np.array(same, np.int64).reshape(len(same), size) for size, same in found.items()]
-
-
 def _ply(path: Path) -> np.ndarray:
     elements = ply_elements(path)
     vertices, faces = elements["vertex"], elements.get("face", {})
@@ -287,7 +279,7 @@ def _ply(path: Path) -> np.ndarray:
 
 def _obj(path: Path) -> np.ndarray:
     corners: list[list[bytes]] = []
-    polygons: list[list[int]] = []
+    polygons: dict[int, list[list[int]]] = {}  # by the number of corners
     with path.open("rb") as file:
         for line in file:
             words = line.split()
@@ -295,8 +287,10 @@ def _obj(path: Path) -> np.ndarray:
                 corners.append(words[1:4])
             elif words[:1] == [b"f"]:
                 numbers = [int(word.split(b"/")[0]) for word in words[1:]]
-                polygons.append([n - 1 if n > 0 else len(corners) + n for n in numbers])
-    return _fans(np.array(corners, np.float64).reshape(-1, 3), _by_size(polygons))
+                polygon = [n - 1 if n > 0 else len(corners) + n for n in numbers]
+                polygons.setdefault(len(polygon), []).append(polygon)
+    tables = [np.array(same, np.int64).reshape(len(same), size) for size, same in polygons.items()]
+    return _fans(np.array(corners, np.float64).reshape(-1, 3), tables)
 
 
 def _stl(path: Path) -> np.ndarray:

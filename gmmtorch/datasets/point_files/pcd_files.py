@@ -99,10 +99,7 @@ def pcd_rows(path: Path, names: Sequence[str] = AXES) -> Rows:
 
 
 def _unpacked(path: Path, n_bytes: int, expected: int) -> bytes:
-    """The data of a compressed file after a header of `n_bytes`: the lengths before and after packing, LZF.
-
-    Raises `DataError` unless they unpack to `expected` bytes.
-    """
+    """The `expected` bytes of a compressed file after a header of `n_bytes`: both lengths, then LZF."""
     data = path.read_bytes()[n_bytes:]
     packed, unpacked = np.frombuffer(data[:8].ljust(8, b"\0"), "<u4").tolist()
     check_size(path, n_bytes + 8 + packed, "compressed points")

@@ -396,23 +396,18 @@ class Gyroscope:
         seconds, rise = np.diff(self.times) / NANOSECONDS, np.diff(self.rates, axis=0)
         is_gap = seconds > IMU_GAP
         means = np.where(is_gap[:, None], 0, self.rates[:-1] + rise / 2)
-        steps = _rotations(means * seconds[:, None])
+        steps = Pose.from_turn(torch.from_numpy(means * seconds[:, None])).rotation
         starts = _products(torch.cat([torch.eye(3)[None].double(), steps]))
         at = (np.searchsorted(self.times, stamps, side="right") - 1).clip(0, len(seconds) - 1)
         since = ((stamps - self.times[at]) / NANOSECONDS).clip(0, seconds[at])
         rates = self.rates[at] + rise[at] * (since / seconds[at] / 2)[:, None]
-        found = starts[at] @ _rotations(rates * since[:, None])
+        found = starts[at] @ Pose.from_turn(torch.from_numpy(rates * since[:, None])).rotation
         turns = torch.cat([starts[:1], found[:-1].mT @ found[1:]])
         inside = (self.times[0] <= stamps) & (stamps <= self.times[-1])
         begun = np.searchsorted(self.times[:-1][is_gap], stamps[1:])
         ended = np.searchsorted(self.times[1:][is_gap], stamps[:-1], side="right")
         turns[1:][~(inside[:-1] & inside[1:]) | (begun > ended)] = torch.nan
         return turns
-
-
-def _rotations(vectors: np.ndarray) -> Tensor:
-    """Rotations (N, 3, 3) of rotation vectors (N, 3), rad."""
-    return Pose.from_turn(torch.from_numpy(vectors)).rotation
 
 
 def _products(turns: Tensor) -> Tensor:

@@ -55,11 +55,11 @@ def expectation(
     Args:
         features: φ (N, F). sample_weight: p (N,). natural: W (K, F).
     """
-    if _is_e_step_fused(features, sample_weight, natural):
-        if features.device.type == "cpu":
-            return _fused_expectation(features, sample_weight, natural)
+    if not _is_e_step_fused(features, sample_weight, natural):
+        return _batched_expectation(features, sample_weight, natural, softmax_dtype)
+    if features.device.type != "cpu":
         return _expectation_in_blocks(features, sample_weight, natural, softmax_dtype)
-    return _batched_expectation(features, sample_weight, natural, softmax_dtype)
+    return _fused_expectation(features, sample_weight, natural)
 
 
 def most_likely(features: Tensor, natural: Tensor) -> Tensor:
@@ -90,9 +90,7 @@ def in_spatial_order(features: Tensor, sample_weight: Tensor) -> tuple[Tensor, T
 
 
 def _is_e_step_fused(*tensors: Tensor) -> bool:
-    features = tensors[0]
-    fits = features.shape[1] in _DIMENSIONS
-    return fits and all(t.dtype == torch.float64 for t in tensors) and is_fused(*tensors)
+    return is_m_step_fused(_DIMENSIONS.get(tensors[0].shape[1], 0), *tensors)
 
 
 def lists_near_components(n_rows: int, n_components: int) -> bool:

@@ -115,11 +115,8 @@ def _crossings(rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: in
     def each(values: Tensor) -> Tensor:
         return values.contiguous().index_select(0, ray)
 
-    k = (
-        torch.arange(len(ray), device=ray.device)
-        .sub(each(torch.cumsum(count, 0) - count - skipped.long()))
-        .double()
-    )
+    before = torch.cumsum(count, 0) - count - skipped.long()
+    k = torch.arange(len(ray), device=ray.device).sub(each(before)).double()
     base = signed[:, axis] * first[axis] + (rays.flipped * stride * (size - 1)).sum(1)
     voxel = torch.addcmul(each(base), k, each(signed[:, axis]))
     step, to_first = each(delta[axis]), first[axis] + 1 - start[axis]  # from the start to the first plane
@@ -141,10 +138,7 @@ def _crossings(rays: _Rays, shape: tuple[int, ...], strides: list[int], axis: in
 
 def _slack(rays: _Rays, axis: int, other: int) -> Tensor:
     """Largest distance (R,) between crossings of two axes that count as one, times the product of their
-    steps.
-
-    It is the same for (axis, other) and (other, axis), so that both take the same decision.
-    """
+    steps: the same for (axis, other) and (other, axis), so that both take the same decision."""
     size_a = rays.start[:, axis].abs() + rays.delta[:, axis] + 1
     size_o = rays.start[:, other].abs() + rays.delta[:, other] + 1
     return TIE * (size_o * rays.delta[:, axis] + size_a * rays.delta[:, other])
@@ -336,13 +330,18 @@ def count_in_blocks(
     """
     starts, ends = starts.double(), ends.double()
     weights = None if weights is None else weights.to(counts().dtype)
-    low = table.low * (1 << table.local_bits)
-    if is_fused(counts(), starts, ends, weights):
-        _count_in_blocks_fused(counts, table, starts, ends, weights, low)
-        return
-    bits = tuple(b + table.local_bits for b in table.bits)
-    one = torch.ones((), dtype=counts().dtype, device=starts.device)
+    low, bits = table.low * (1 << table.local_bits), tuple(b + table.local_bits for b in table.bits)
     shape, strides = tuple(1 << b for b in bits), packed_strides(bits)
+    if is_fused(counts(), starts, ends, weights):
+        _open_blocks_of_rays(table, starts, ends)
+        rays = rays_argument(starts, ends, shape, strides, low)
+        shifts, above = ([shift for shift, _ in _fields(widths)[:2]] for widths in (bits, table.bits))
+        masks = shape[1] - 1, shape[2] - 1 if len(shape) == 3 else 0
+        fields = table.local_bits, *shifts, *masks, *above
+        n_rays, n_items = len(starts), _n_items(len(starts), starts.device)
+        _IN_BLOCKS[counts().dtype](n_items, n_rays, *rays, table.first, *fields, weights, counts())
+        return
+    one = torch.ones((), dtype=counts().dtype, device=starts.device)
     for voxel, ray in traverse(starts, ends, shape, strides=strides, low=low):
         block, place = _split(voxel, table.bits, table.local_bits)
         first = table.first.index_select(0, block)
@@ -353,35 +352,19 @@ def count_in_blocks(
         counts().scatter_add_(0, first.add_(place), source)
 
 
-def _count_in_blocks_fused(
-    counts: Callable[[], Tensor],
-    table: BlockTable,
-    starts: Tensor,
-    ends: Tensor,
-    weights: Tensor | None,
-    low: Tensor,
-) -> None:
-    device, side, dim = starts.device, 1 << table.local_bits, len(table.bits)
-    n_rays = starts.shape[0]
-    # A walk over blocks finds those to store. Division by a power of two is exact, and `unit` keeps the tie
-    # rule of the voxels, so that the walk over voxels meets the same blocks.
-    marked = torch.zeros_like(table.first, dtype=torch.bool)
-    shape = tuple(1 << b for b in table.bits)
-    strides = packed_strides(table.bits)
+def _open_blocks_of_rays(table: BlockTable, starts: Tensor, ends: Tensor) -> None:
+    """Stores the blocks that rays leave, by a walk over blocks.
+
+    Division by a power of two is exact, and `unit` keeps the tie rule of the voxels, so that the walk over
+    voxels meets the same blocks.
+    """
+    marked, side = torch.zeros_like(table.first, dtype=torch.bool), 1 << table.local_bits
+    shape, strides = tuple(1 << b for b in table.bits), packed_strides(table.bits)
     rays = rays_argument(starts / side, ends / side, shape, strides, table.low, unit=1 / side)
-    _MARK(n_rays, *rays, marked)
+    _MARK(len(starts), *rays, marked)
     new = (marked & (table.first < 0)).nonzero().squeeze(1)
     if new.numel():
         table.open(new)
-    bits = tuple(b + table.local_bits for b in table.bits)
-    rays = rays_argument(starts, ends, tuple(1 << b for b in bits), packed_strides(bits), low)
-    shifts = [shift for shift, _ in _fields(bits)]
-    above = [shift for shift, _ in _fields(table.bits)]
-    mask2 = (1 << bits[2]) - 1 if dim == 3 else 0
-    fields = [table.local_bits, shifts[0], shifts[1], (1 << bits[1]) - 1, mask2, above[0], above[1]]
-    kernel = _IN_BLOCKS[counts().dtype]
-    n_items = _n_items(n_rays, device)
-    kernel(n_items, n_rays, *rays, table.first, *fields, weights, counts())
 
 
 def mark_cells_of_rays(

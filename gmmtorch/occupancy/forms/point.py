@@ -232,24 +232,25 @@ class PointForm:
             return self._added(given, before)
 
         def evaluated(part: slice) -> PointEvidence:
-            return self._evaluate(query[part], before.hits[part], before.misses[part])
+            points, hits, misses = query[part], before.hits[part], before.misses[part]
+            if is_fused(points, self.rows):
+                return self._added(PointGroups(points), PointEvidence(hits, misses))
+            for rows, blocks, chunks in self._blocks(points):
+                evidence = torch.cat([self._of_blocks(blocks, chunk) for chunk in chunks], 1)
+                hit, miss = evidence.flatten(1)[:, blocks.slot]
+                hits, misses = hits.index_add(0, rows, hit), misses.index_add(0, rows, miss)
+            return PointEvidence(hits, misses)
 
         parts = list(chunked(len(query), _CHUNK_POINTS, evaluated)) or [before]
         hits, misses = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
         return PointEvidence(hits, misses)
 
-    def _evaluate(self, points: Tensor, hits: Tensor, misses: Tensor) -> PointEvidence:
-        if is_fused(points, self.rows):
-            return self._added(PointGroups(points), PointEvidence(hits, misses))
+    def _blocks(self, points: Tensor) -> Iterator[tuple[Tensor, PointBlocks, Iterator[slice]]]:
+        """Rows (R,) of points near cones, their blocks, and chunks of the blocks."""
         for rows, number in self.index.parts(points):
-            if not len(rows):
-                continue
-            blocks = PointBlocks.of(points[rows], number[rows])
-            chunks = chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
-            evidence = torch.cat([self._of_blocks(blocks, part) for part in chunks], 1)
-            hit, miss = evidence.flatten(1)[:, blocks.slot]
-            hits, misses = hits.index_add(0, rows, hit), misses.index_add(0, rows, miss)
-        return PointEvidence(hits, misses)
+            if len(rows):
+                blocks = PointBlocks.of(points[rows], number[rows])
+                yield rows, blocks, chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS)
 
     def _added(self, points: PointGroups, found: PointEvidence) -> PointEvidence:
         """`found`, to which hits and misses at M points are added by the fused kernel."""
@@ -284,11 +285,9 @@ class PointForm:
         """Average number of cones evaluated for each of the points (M, D)."""
         query = check_queries(points, self.dim)
         n_rows = 0
-        for rows, number in self.index.parts(query):
-            if len(rows):
-                blocks = PointBlocks.of(query[rows], number[rows])
-                for part in chunks_of(self.index.lists.lengths()[blocks.bucket], CHUNK_PAIRS):
-                    n_rows += len(self._near_cones(blocks, part)[0]) * blocks.points.shape[1]
+        for _, blocks, chunks in self._blocks(query):
+            n_pairs = sum(len(self._near_cones(blocks, part)[0]) for part in chunks)
+            n_rows += n_pairs * blocks.points.shape[1]
         return n_rows / query.shape[0]
 
 
@@ -307,12 +306,8 @@ def _table_of(cones: Cones, axes: Tensor, resolution: float) -> PointTable:
     spread = resolution**2 / 12
     log_scale = -0.5 * (2 * math.pi * (variances + spread)).log().sum(1) + dim * math.log(resolution)
     rows = [axes.flatten(1), means, origins, seen, variances, 1 / (variances + spread)]
-    rows += [
-        spread * (toward * toward).sum(1, keepdim=True),
-        log_scale[:, None],
-        counts[:, None],
-        (counts * ~cones.max_range)[:, None],
-    ]
+    last = spread * (toward * toward).sum(1), log_scale, counts, counts * ~cones.max_range
+    rows += [column[:, None] for column in last]
     above = torch.triu_indices(dim, dim, 1, device=covariances.device)
     tilts = turned[:, above[0], above[1]] if covariances.requires_grad else turned.new_zeros(len(means), 0)
     return PointTable(torch.cat(rows, 1), tilts)

@@ -332,10 +332,7 @@ class MassPatches(Patches):
 def _cross_sections(offset: Tensor, edges: Tensor, volume: Tensor, cutoff: float) -> MassPatches:
     """Cross-sections of boxes perpendicular to their longest whitened edge, which has the closed form.
 
-    Args:
-        offset: W(q − μ) of the centres, (D, P).
-        edges: whitened edges, (D, D, P).
-        volume: |det of the whitened edges| (P,).
+    offset: W(q − μ) of the centres, (D, P). edges: whitened, (D, D, P). volume: |det of the edges| (P,).
     """
     dim = len(offset)
     lengths = length(edges)

@@ -430,10 +430,8 @@ class SparseEvidence(SparseLattice):
         self._slots = torch.arange(1, self.n_blocks + 1, device=self.device)
 
     def _counts_in(self, corner: Tensor, slots: Tensor, box: Box) -> Tensor:
-        """A copy (2, b, cells) of the counts in blocks (b,), with 0 for cells outside a box.
-
-        The blocks are given by their lowest cells (b, D) and their slots (b,).
-        """
+        """A copy (2, b, cells) of the counts in blocks with these lowest cells (b, D) and slots (b,); 0 for
+        cells outside a box."""
         counts = self.counts[:, slots]
         cut = ((corner < box.low) | (corner + self.block_side > box.high)).any(1).nonzero().squeeze(1)
         if len(cut):
