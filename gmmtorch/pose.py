@@ -184,14 +184,9 @@ class Pose:
         (_, xy, xz), (yx, _, yz), (zx, zy, _) = (row.unbind(-1) for row in rotation.unbind(-2))
         own = torch.cat([1 - trace + 2 * diagonal, 1 + trace], -1)  # 4 x², 4 y², 4 z², 4 w²
         products = rotation.new_zeros(*own.shape, 4)  # 4 q qᵀ, whose longest row is the most exact
-        for (i, j), value in {
-            (0, 1): xy + yx,
-            (0, 2): xz + zx,
-            (1, 2): yz + zy,
-            (0, 3): zy - yz,
-            (1, 3): xz - zx,
-            (2, 3): yx - xy,
-        }.items():
+        places = (0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3)
+        values = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
+        for (i, j), value in zip(places, values, strict=True):
             products[..., i, j] = products[..., j, i] = value
         products.diagonal(dim1=-2, dim2=-1).copy_(own)
         best = torch.cat([trace, diagonal], -1).argmax(-1)

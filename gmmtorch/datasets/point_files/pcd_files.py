@@ -24,11 +24,8 @@ from gmmtorch.datasets.point_files.point_rows import (
 from gmmtorch.errors import DataError
 
 _MAX_POINT_BYTES = 1 << 24
-_CODES = {
-    **{f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)},
-    "F4": "<f4",
-    "F8": "<f8",
-}
+_CODES = {f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
+_CODES |= {"F4": "<f4", "F8": "<f8"}
 _LZF_LITERALS = 32  # a smaller control byte announces literal bytes, another one repeats earlier bytes
 
 

@@ -17,10 +17,7 @@ BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 
 _CODES = {
     **{f"{kind}int{bits}": f"{kind or 'i'}{bits // 8}" for kind in ("", "u") for bits in (8, 16, 32, 64)},
-    "bool": "u1",
-    "byte": "u1",
-    "char": "u1",
-    "octet": "u1",
+    **dict.fromkeys(("bool", "byte", "char", "octet"), "u1"),
     "float32": "f4",
     "float64": "f8",
 }
@@ -119,14 +116,9 @@ class _Cursor:
         same = [(field, code, at + stride) for field, code, at in first] == second
         if not same or stride != self._aligned(stride, widest):  # their alignment varies
             return None
-        dtype = np.dtype(
-            {
-                "names": [field for field, _, _ in first],
-                "formats": [self._order + code for _, code, _ in first],
-                "offsets": [at - start for _, _, at in first],
-                "itemsize": end - start,
-            }
-        )
+        names, codes, places = zip(*first, strict=True)
+        formats, offsets = [self._order + code for code in codes], [at - start for at in places]
+        dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end - start})
         last = start + (count - 1) * stride + dtype.itemsize
         if last > len(self._data):
             raise ValueError(f"{count} entries of {stride} bytes exceed the message")
