@@ -86,11 +86,7 @@ class AlignmentTarget:
     """
 
     def __init__(
-        self,
-        surfaces: Parameters,
-        blur: float,
-        normals: Tensor | None = None,
-        lists: NearLists | None = None,
+        self, surfaces: Parameters, blur: float, normals: Tensor | None = None, lists: NearLists | None = None
     ) -> None:
         means, dim = surfaces.means, surfaces.means.shape[1]
         covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)

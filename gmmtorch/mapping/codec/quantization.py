@@ -128,11 +128,7 @@ def quantize(components: Components, coarse: bool = False) -> Quantized:
 
 
 def _quantized(
-    c: Components,
-    places: Lattice,
-    rows: Ints | None = None,
-    ids: Ints | None = None,
-    coarse: bool = False,
+    c: Components, places: Lattice, rows: Ints | None = None, ids: Ints | None = None, coarse: bool = False
 ) -> Quantized:
     """`quantize` of components at these places, on the CPU; in the order of `rows` (K,), with these ids."""
     count, flags = _support_steps(c.support.double()), c.max_range

@@ -107,10 +107,7 @@ def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -
 
 
 def em_step(
-    rows: Rows,
-    reg_covar: float,
-    softmax_dtype: torch.dtype = torch.float32,
-    covariance_type: str = "full",
+    rows: Rows, reg_covar: float, softmax_dtype: torch.dtype = torch.float32, covariance_type: str = "full"
 ) -> Steps[Parameters]:
     """EM steps on points, centred, or cells. Covariances have the shape of their type.
 

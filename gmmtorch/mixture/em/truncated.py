@@ -20,13 +20,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gmmtorch.kernels import (
-    chunk_elements,
-    chunked,
-    fused_truncated_em,
-    is_m_step_fused,
-    n_sampled_rows,
-)
+from gmmtorch.kernels import chunk_elements, chunked, fused_truncated_em, is_m_step_fused, n_sampled_rows
 from gmmtorch.linalg import argsort, largest_indices, pack_symmetric, unpack_symmetric
 from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.distributed import SINGLE_PROCESS, Processes
