@@ -34,8 +34,7 @@ _COLUMNS = 256  # of the inverse at a time
 class Edges(NamedTuple):
     """E measured motions: source, target (E,); motions (E), source ← target; information (E, F, F), the
     inverse covariance of a shift (m) and a turn (rad) in the frame of the target; and whether an edge is a
-    closure (E,), which may be wrong.
-    """
+    closure (E,), which may be wrong."""
 
     source: Tensor
     target: Tensor
@@ -58,10 +57,9 @@ class Edges(NamedTuple):
 
 
 class OptimisedPoses(NamedTuple):
-    """Poses (N), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the
-    frame of the sensor, zero for the first pose, NaN if they were not asked for; weight (E,) of each edge,
-    near 0 for a rejected closure; and whether the last step was small.
-    """
+    """Poses (N), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the frame of the
+    sensor, zero for the first pose, NaN if they were not asked for; weight (E,) of each edge, near 0 for a
+    rejected closure; and whether the last step was small."""
 
     poses: Pose
     covariances: Tensor
@@ -70,14 +68,10 @@ class OptimisedPoses(NamedTuple):
 
 
 def optimised(poses: Pose, edges: Edges, scale: float = 3.0, with_covariances: bool = True) -> OptimisedPoses:
-    """The poses (N) that agree best with the edges, from a first guess; the first one stays.
-
-    scale: deviations c at which a closure loses most of its weight. with_covariances: their time is
-    proportional to N².
-
-    Raises `InvalidArgumentError` if an edge names a pose that does not exist, or if the edges do not connect
-    all poses.
-    """
+    """The poses (N) that agree best with the edges, from a first guess; the first one stays. scale:
+    deviations c at which a closure loses most of its weight. with_covariances: their time is proportional to
+    N². Raises `InvalidArgumentError` if an edge names a pose that does not exist, or if the edges do not
+    connect all poses."""
     n, free = len(poses), edges.information.shape[1]
     _check(n, edges)
     if n == 1:
@@ -127,10 +121,8 @@ def _weights(poses: Pose, edges: Edges, scale: float) -> Tensor:
 
 def _normal_equations(poses: Pose, edges: Edges, weights: Tensor) -> tuple[csc_matrix, np.ndarray]:
     """The Gauss–Newton Hessian and the gradient for steps of all poses but the first one, in their frames.
-
     With T_i ← T_i Exp(x_i) and the error's rotation R and turn φ: ∂e/∂x_j = diag(R, J_r(φ)⁻¹) and
-    ∂e/∂x_i = −∂e/∂x_j Ad(T_j⁻¹ T_i).
-    """
+    ∂e/∂x_i = −∂e/∂x_j Ad(T_j⁻¹ T_i)."""
     n, free = len(poses), edges.information.shape[1]
     between = poses[edges.source].inverse() @ poses[edges.target]
     off = edges.motions.inverse() @ between

@@ -257,10 +257,8 @@ _ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built
 
 @dataclass(frozen=True)
 class MapSettings:
-    """The settings of a map that its file contains, without the learning rule.
-
-    time: of the last scan (s), in a map with a half-life; None otherwise.
-    """
+    """The settings of a map that its file contains, without the learning rule. time: of the last scan (s), in
+    a map with a half-life; None otherwise."""
 
     resolution: float
     method: str

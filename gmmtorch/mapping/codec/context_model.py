@@ -112,9 +112,7 @@ def first_tables(coarse: bool) -> ChanceTables:
 
 class _Walk:
     """Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
-
-    Contexts and predictions are stated in docs/formats.md.
-    """
+    Contexts and predictions are stated in docs/formats.md."""
 
     def __init__(self, coder: RangeCoder, batch: CodedBatch) -> None:
         self._first = dict(zip(FIELDS, coder.first, strict=False))

@@ -107,10 +107,8 @@ class RiemannianGaussianMixture(MixtureEstimator):
 
 
 class Frames(NamedTuple):
-    """H_k in parts: H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0, Σ⁻¹ = AᵀA and 1/s = ‖b‖².
-
-    linear: A (K, D+1, D); means: μ (K, D); offset: b (K, D+1).
-    """
+    """H_k in parts: H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0, Σ⁻¹ = AᵀA and 1/s = ‖b‖². linear: A
+    (K, D+1, D); means: μ (K, D); offset: b (K, D+1)."""
 
     linear: Tensor
     means: Tensor
@@ -184,10 +182,8 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Iterate:
-    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2).
-
-    Each row of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η.
-    """
+    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2). Each row
+    of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η."""
 
     likelihood: Likelihood
     frames: Frames
@@ -198,10 +194,8 @@ class Iterate:
     inverse_hessian: Tensor
 
     def bounded(self, direction: Tensor) -> Tensor:
-        """The direction with a limited norm in each component.
-
-        Outdated curvature can give an arbitrarily long step to a component that loses its points.
-        """
+        """The direction with a limited norm in each component. Outdated curvature can give an arbitrarily
+        long step to a component that loses its points."""
         return direction / (direction.norm(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1)
 
     def move(self, tangent: Tensor) -> Iterate:
@@ -270,10 +264,8 @@ def ascend(
     point: Iterate, *, tol: float, max_iter: int, on_iteration: OnIteration | None = None
 ) -> tuple[Iterate, list[float], bool]:
     """Climb from a point. Returns the final point, the value after each iteration, and whether it converged.
-
     Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
-    gain less, to second order; or no higher point was found, to rounding. Values never decrease.
-    """
+    gain less, to second order; or no higher point was found, to rounding. Values never decrease."""
     memory, values = Memory(maxlen=_MEMORY), list[float]()
     for iteration in range(max_iter):
         found = _climb(point, memory)
@@ -289,10 +281,8 @@ def ascend(
 
 
 def _climb(point: Iterate, memory: Memory) -> Iterate:
-    """A higher point, or the same point if there is none.
-
-    Clears the memory if its direction does not ascend.
-    """
+    """A higher point, or the same point if there is none. Clears the memory if its direction does not
+    ascend."""
     while True:
         direction = point.bounded(quasi_newton(point, memory))
         length, found = search(point, direction)
@@ -309,10 +299,8 @@ def _climb(point: Iterate, memory: Memory) -> Iterate:
 
 def search(point: Iterate, direction: Tensor) -> tuple[float, Iterate]:
     """Step length along a direction, and the point there; 0 and `point` if the direction does not ascend.
-
-    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the
-    weak Wolfe conditions hold (Nocedal & Wright, 3.6).
-    """
+    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the weak
+    Wolfe conditions hold (Nocedal & Wright, 3.6)."""
     slope = _dot(point.gradient, direction)
     best = (0.0, point)
     if not slope > 1e-16 * abs(point.value):
