@@ -356,8 +356,7 @@ class Odometry:
             self._search_again(lost[0])
 
     def _search_again(self, scan: Keyframe) -> None:
-        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
-        in a row none is searched for: the pose that ends them is less sure."""
+        """The last scan but one, if it alone was lost, between the poses on both sides of it."""
         if self._local is None or len(scan.points) < _FEWEST:
             return
         number, last = len(self._poses) - 2, self._last_frame

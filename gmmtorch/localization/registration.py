@@ -240,8 +240,7 @@ def _blurs(
 
 
 def _levels(mixture: Parameters, blurs: list[float]) -> list[Parameters]:
-    """For each blur s, the mixture with ½ s² I added to every covariance. Once s exceeds the components'
-    size, those in a cell of side s are merged first."""
+    """For each blur s, the mixture with ½ s² I added to every covariance; small components are merged."""
     size = float(deviations(mixture)[:, -1].median())
     eye = torch.eye(mixture.means.shape[1]).to(mixture.means)
     levels = []
@@ -282,8 +281,7 @@ def _world(motions: Pose, here: Tensor, there: Tensor) -> Pose:
 
 
 def _promising(motions: Pose, log_score: Tensor, radius: float, apart: float) -> Tensor:
-    """The best motions by falling score, without those within `apart` (m) of a better one or far below the
-    best."""
+    """The best motions by falling score, without those within `apart` (m) of a better one."""
     order = log_score.argsort(descending=True, stable=True)
     rotations, translations = motions[order].parts
     turn = torch.linalg.matrix_norm(rotations[:, None] - rotations) / math.sqrt(2)

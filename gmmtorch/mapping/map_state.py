@@ -144,8 +144,7 @@ class MapState(DeviceModule):
         return Components.concatenate([*self._parts_before, self._upcoming()[0]])
 
     def _upcoming(self) -> tuple[Components, int]:
-        """The last block with the components of the unfinished window, not rounded; and the number of the
-        next new one after them."""
+        """The last block with the components of the unfinished window, and the number of the next new one."""
         if not self._pending:
             return self._last, self._next_number
         if self._learned is None:

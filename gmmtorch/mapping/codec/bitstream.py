@@ -54,8 +54,7 @@ def _shortest_code(values: Ints) -> tuple[int, int, int]:
 
 
 def _rice_code(values: Ints) -> tuple[int, float]:
-    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits: a float, which does not
-    overflow."""
+    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits."""
     n = len(values)
     if not n:
         return 0, 0.0

@@ -105,8 +105,7 @@ def _geometry(values: Quantized) -> bytes:
 
 
 def _coarse_places(values: Quantized) -> Lattice | None:
-    """The means and covariances on the coarse lattice, perhaps with other axis orders; None unless all
-    components are on it."""
+    """The means and covariances on the coarse lattice; None unless all components are on it."""
     count = values.count.numpy()
     if not len(values) or not np.array_equal(count, coarse_counts(count)):
         return None

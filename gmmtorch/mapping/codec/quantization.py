@@ -323,8 +323,7 @@ def quantize_numbered(components: Components, robot: int, first: int) -> Quantiz
 
 
 def _numbering(ids: Ints, by_place: Ints, robot: int, first: int) -> tuple[Ints, Ints]:
-    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones in the
-    order `by_place` (J,) of these."""
+    """Ids (K, 2) after numbering, and the order (K,): numbered components, then new ones `by_place` (J,)."""
     is_new = ids[:, 1] < 0
     order = np.concatenate([np.flatnonzero(~is_new), np.flatnonzero(is_new)[by_place]])
     made = ids[order]

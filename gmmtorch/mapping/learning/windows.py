@@ -146,8 +146,7 @@ def _learned(
 def _explain(
     components: Components, scans: Sequence[Scan], rule: NoveltyRule, weight: float
 ) -> tuple[Components, list[Scan]]:
-    """The components with the counts of the points that they explain, and the novel beams of each scan
-    that no component explains."""
+    """The components with the counts of points that they explain, and the other novel beams of each scan."""
     remaining = []
     for scan in scans:
         novel = scan.select(novel_beams(components, scan, rule))
