@@ -68,10 +68,14 @@ class OptimisedPoses(NamedTuple):
 
 
 def optimised(poses: Pose, edges: Edges, scale: float = 3.0, with_covariances: bool = True) -> OptimisedPoses:
-    """The poses (N) that agree best with the edges, from a first guess; the first one stays. scale:
-    deviations c at which a closure loses most of its weight. with_covariances: their time is proportional to
-    N². Raises `InvalidArgumentError` if an edge names a pose that does not exist, or if the edges do not
-    connect all poses."""
+    """The poses (N) that agree best with the edges, from a first guess; the first one stays.
+
+    scale: deviations c at which a closure loses most of its weight. with_covariances: their time is
+    proportional to N².
+
+    Raises `InvalidArgumentError` if an edge names a pose that does not exist, or if the edges do not connect
+    all poses.
+    """
     n, free = len(poses), edges.information.shape[1]
     _check(n, edges)
     if n == 1:
@@ -121,8 +125,10 @@ def _weights(poses: Pose, edges: Edges, scale: float) -> Tensor:
 
 def _normal_equations(poses: Pose, edges: Edges, weights: Tensor) -> tuple[csc_matrix, np.ndarray]:
     """The Gauss–Newton Hessian and the gradient for steps of all poses but the first one, in their frames.
+
     With T_i ← T_i Exp(x_i) and the error's rotation R and turn φ: ∂e/∂x_j = diag(R, J_r(φ)⁻¹) and
-    ∂e/∂x_i = −∂e/∂x_j Ad(T_j⁻¹ T_i)."""
+    ∂e/∂x_i = −∂e/∂x_j Ad(T_j⁻¹ T_i).
+    """
     n, free = len(poses), edges.information.shape[1]
     between = poses[edges.source].inverse() @ poses[edges.target]
     off = edges.motions.inverse() @ between

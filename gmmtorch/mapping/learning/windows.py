@@ -288,8 +288,11 @@ _LIMITS = {"through": 1.0, "reach": 3.0, "grazing": 4.0}  # see `PassLimits`; 4:
 
 @dataclass(frozen=True)
 class Doubts:
-    """The state of forgetting, besides the components. ids: (J, 2) of the components in doubt. log_odds: (J,)
-    that their surfaces are gone, above 0. time: of the last scan (s); None: not known."""
+    """The state of forgetting, besides the components.
+
+    ids: (J, 2) of the components in doubt. log_odds: (J,) that their surfaces are gone, above 0.
+    time: of the last scan (s); None: not known.
+    """
 
     ids: Tensor
     log_odds: Tensor

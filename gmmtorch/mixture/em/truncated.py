@@ -266,9 +266,11 @@ class Rows:
 
 class Groups(NamedTuple):
     """Rows sorted by owner, in blocks of B rows of one owner. Rows of weight 0 fill incomplete blocks.
+
     features: (b, B, F) relative to the center of the owner. weight: (b, B). owner: (b,) of each block.
-    centers: (K, D) of the owners. n_rows, mass, spread: (K,) number of rows, Σp and Σp‖x − center‖² of each
-    owner. row, slot: (N,) row `row[i]` is stored in slot `slot[i]` of the b·B slots."""
+    centers: (K, D) of the owners. n_rows, mass, spread: (K,) number of rows, Σp and Σp‖x − center‖² of
+    each owner. row, slot: (N,) row `row[i]` is stored in slot `slot[i]` of the b·B slots.
+    """
 
     features: Tensor
     weight: Tensor

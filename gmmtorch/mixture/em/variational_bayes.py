@@ -36,10 +36,13 @@ class Prior(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """Posterior of K components. concentration: (2, K) the Beta parameters of the sticks, or (1, K) the
-    Dirichlet parameters. mean_precision: β (K,), the number of points that determine each mean. means: m
-    (K, D). degrees_of_freedom: ν (K,). covariances: W⁻¹/ν, the inverse of the expected precision, in the
-    shape of the covariance type."""
+    """Posterior of K components.
+
+    concentration: (2, K) the Beta parameters of the sticks, or (1, K) the Dirichlet parameters.
+    mean_precision: β (K,), the number of points that determine each mean. means: m (K, D).
+    degrees_of_freedom: ν (K,). covariances: W⁻¹/ν, the inverse of the expected precision, in the shape of the
+    covariance type.
+    """
 
     concentration: Tensor
     mean_precision: Tensor

@@ -69,9 +69,11 @@ class Tree(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Nodes of a level, with their place in the tree. own: (G,) Σ p log N(x) over a node's members, nats.
-    bound: (G,) Σ p log(π N(x)/q), q the shares of the points: the node's part of the lower bound of the whole
-    cloud."""
+    """Nodes of a level, with their place in the tree.
+
+    own: (G,) Σ p log N(x) over a node's members, nats. bound: (G,) Σ p log(π N(x)/q), q the shares of the
+    points: the node's part of the lower bound of the whole cloud.
+    """
 
     place: Tensor
     parameters: Parameters
