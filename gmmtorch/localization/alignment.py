@@ -53,9 +53,8 @@ _PARALLEL, _ANOTHER = math.radians(6), math.radians(30)  # between normals of on
 
 
 class Alignment(NamedTuple):
-    """Of B motions, world ← sensor: ℓ/N (B,), the share of explained points (B,), −∇²ℓ (B, F, F) in a shift
-    v (m) and a turn ω (rad) about the sensor, F = D + D(D−1)/2, and whether the last step was small (B,).
-    """
+    """Of B motions, world ← sensor: ℓ/N (B,), the share of explained points (B,), −∇²ℓ (B, F, F) in a shift v
+    (m) and a turn ω (rad) about the sensor, F = D + D(D−1)/2, and whether the last step was small (B,)."""
 
     motions: Pose
     score: Tensor
@@ -66,8 +65,7 @@ class Alignment(NamedTuple):
     @property
     def evidence(self) -> Tensor:
         """Nats of a point (B,) for a pose: ℓ/N, in which a point that touches many components counts more
-        than its surface tells, and as much for each explained point.
-        """
+        than its surface tells, and as much for each explained point."""
         return self.score + _INSIDE * self.explained
 
     def at(self, rows: Tensor) -> Alignment:
@@ -86,11 +84,7 @@ class AlignmentTarget:
     """
 
     def __init__(
-        self,
-        surfaces: Parameters,
-        blur: float,
-        normals: Tensor | None = None,
-        lists: NearLists | None = None,
+        self, surfaces: Parameters, blur: float, normals: Tensor | None = None, lists: NearLists | None = None
     ) -> None:
         means, dim = surfaces.means, surfaces.means.shape[1]
         covariances = surfaces.covariances + blur**2 * torch.eye(dim).to(means)
@@ -134,8 +128,7 @@ def _near_lists(means: Tensor, covariances: Tensor, blur: float) -> NearLists:
 
 def seen_normals(surfaces: Components) -> Tensor:
     """Unit normals (K, D), towards the sensor, of the surfaces that are flat and seen from one side; zero for
-    the others. In the order of `surface_mixture`.
-    """
+    the others. In the order of `surface_mixture`."""
     solid = ~surfaces.max_range & (surfaces.support > 0)
     variances, axes = torch.linalg.eigh(surfaces.covariances.double())
     normals = axes[:, :, 0]
@@ -235,16 +228,14 @@ def distinct(motions: Pose, distance: float, angle: float) -> Tensor:
 
 def best_distinct(motions: Pose, score: Tensor, distance: float) -> Tensor:
     """Rows of motions by falling score, without those close to a better one: by less than `distance` (m) and
-    the turn that belongs to it.
-    """
+    the turn that belongs to it."""
     order = score.argsort(descending=True, stable=True)
     return order[distinct(motions[order], distance, _TURNED * distance)]
 
 
 def around(start: Pose, distance: float, angle: float, blur: float) -> Pose:
     """Starts on a lattice of places, `blur` metres apart, up to `distance` metres from one along the ground,
-    and of headings up to `angle` radians; the start itself among them.
-    """
+    and of headings up to `angle` radians; the start itself among them."""
     like = start.translation
     n, m = math.ceil(distance / blur), math.ceil(angle / (_TURNED * blur))
     side = torch.linspace(-distance, distance, 2 * n + 1).to(like)
@@ -257,8 +248,7 @@ def around(start: Pose, distance: float, angle: float, blur: float) -> Pose:
 
 def everywhere(places: Tensor, blur: float, axes: Tensor, targets: Tensor) -> Pose:
     """Starts in space at places (S, 3), with all headings about each of some axes (A, 3) of the map, to which
-    they turn the axes (A, 3) of the sensor.
-    """
+    they turn the axes (A, 3) of the sensor."""
     n = math.ceil(math.pi / (_TURNED * blur))
     angles = torch.arange(n).to(places) * (2 * math.pi / n)
     headings = Pose.from_yaw(angles, torch.zeros_like(places[0])).rotation
@@ -269,8 +259,7 @@ def everywhere(places: Tensor, blur: float, axes: Tensor, targets: Tensor) -> Po
 def main_normals(surfaces: Parameters, most: int = 3) -> Tensor:
     """Unit vectors (A, 3), A at most `most`, of either sign: the normal of most of the flat area, then of
     most of what is left when the surfaces about parallel to it are taken away. Indoors these are up and the
-    directions of two walls.
-    """
+    directions of two walls."""
     variances, axes = torch.linalg.eigh(surfaces.covariances)
     normals = axes[:, :, 0]
     is_flat = (variances[:, 0] < _THIN**2) & (variances[:, 0] < _FLAT**2 * variances[:, 1])

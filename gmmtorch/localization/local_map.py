@@ -78,8 +78,7 @@ _KEPT_POINTS = 200  # of each earlier scan, that a new scan must not look throug
 
 class Keyframe(NamedTuple):
     """A scan that stays: its points (N, D) in the frame of the sensor, in random order, and its pose,
-    world ← sensor.
-    """
+    world ← sensor."""
 
     points: Tensor
     pose: Pose
@@ -91,15 +90,6 @@ class _Found(NamedTuple):
     location: Location
     total: float
     contradicted: float
-
-
-class Placement(NamedTuple):
-    """Where some scans lie together: a location of each, with a doubt if the scan does not support it; and
-    whether all other poses are less likely by odds of 100, and so are places that the map does not show.
-    """
-
-    locations: list[Location]
-    is_sure: bool
 
 
 class LocalMap:
@@ -145,10 +135,8 @@ class LocalMap:
         best: _Found | None = None
         for starts, targets in self._searches(scan, expected, wide):
             tried = self._climbed(scan, expected, starts, targets)
-            confirmed = False  # by another search that found the same pose
-            if best is not None and best.location.found:
-                before, now = (Pose.from_matrix(one.location.pose[None]) for one in (best, tried))
-                confirmed = float(differences(before, now, _APART, _APART)) < 1
+            # By another search that found the same pose:
+            confirmed = best is not None and best.location.found and _is_same(best.location, tried.location)
             # In 2D a lost scan stays where the first search finds it: that is near the prediction.
             counts = tried.location.found or self.dim == 3
             if best is None or (
@@ -190,14 +178,16 @@ class LocalMap:
         last = expected.poses[-1]
         angles = torch.arange(_HEADINGS).double() * (2 * math.pi / _HEADINGS)
         turned = Pose.from_yaw(angles, torch.zeros(3).double()).rotation @ last.rotation
-        found = register(
-            mixture, self._components, Pose(turned, last.translation.expand(_HEADINGS, 3)).matrix
-        )
+        starts = Pose(turned, last.translation.expand(_HEADINGS, 3))
+        found = register(mixture, self._components, starts.matrix)
         yield Pose.from_matrix(found.transform[None]), self._targets
 
-    def placed(self, scans: Sequence[Keyframe], near: Pose, reach: float) -> Placement:
+    def placed(self, scans: Sequence[Keyframe], near: Pose, reach: float) -> tuple[list[Location], bool]:
         """Where some scans in 2D, whose poses agree with each other, most likely lie together, by the sum of
         their evidence: at their poses, or with the first one up to `reach` metres from a pose `near` (1).
+
+        Returns a location of each, with a doubt if the scan does not support it; and whether all other poses
+        are less likely by odds of 100, and so are places that the map does not show.
         """
         ways = [scans[0].pose.inverse() @ scan.pose for scan in scans]
         some = [scan.points[:_COARSE_POINTS] for scan in scans]
@@ -225,7 +215,7 @@ class LocalMap:
             covariance = pose_covariance(seen.information[0], points)[0]
             doubts = () if float(gain[best]) > 0 else ("the scan does not support the place",)
             locations.append(Location(place.matrix[0], covariance, float(seen.explained[0]), doubts))
-        return Placement(locations, lead > _LEAD and float(total[best]) > _SURE + tries)
+        return locations, lead > _LEAD and float(total[best]) > _SURE + tries
 
     def _starts_together(
         self, scans: Sequence[Keyframe], ways: Sequence[Pose], near: Pose, reach: float
@@ -256,10 +246,7 @@ class LocalMap:
         angle: float,
         most: int,
     ) -> Pose:
-        """Some poses, and at most `most` of the best starts around them.
-
-        They are `spacing` metres apart, with headings up to `angle` radians from those of the poses.
-        """
+        """Some poses, and the best starts around them: `spacing` metres and up to `angle` radians apart."""
         reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
         side = torch.arange(-reach, reach + 1).double() * spacing
         shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, self.dim - 2))
@@ -332,15 +319,14 @@ class LocalMap:
         chosen = rivals | (torch.arange(len(total)) == 0)
         best = int(torch.where(chosen, expected.unlikely(poses), torch.inf).argmin())
         covariance, deviation = pose_covariance(found.information[best], points)
-        loosest = float(deviation)
+        explained, loosest = float(found.explained[best]), float(deviation)
         contradicted = float(view.in_free_space[best] + view.looked_through[best])
         seen = 1 - float(view.unknown[best])
-        share, doubts = min(float(found.explained[best]) / max(seen, _LEAST_SEEN), 1.0), []
+        share, doubts = min(explained / max(seen, _LEAST_SEEN), 1.0), []
         if float(total[best]) < -NEVER / 2:
             doubts.append("the pose is farther from where it is expected than max_step and max_turn allow")
         lead = total[best] - torch.where(is_apart, total, -torch.inf).amax()
         unlikely = float(expected.unlikely(poses[[best]]))
-        explained = float(found.explained[best])
         probability = _probability(explained, contradicted, 1 - seen, float(lead), loosest, unlikely)
         if probability < (_LEAST_PROBABILITY if unlikely < _SURPRISING else _LEAST_OF_SURPRISING):
             doubts.append(
@@ -414,8 +400,7 @@ def _scatter(pose: Pose, others: Pose) -> Tensor:
 
 class View(NamedTuple):
     """Of B poses: shares (B,) of the points that lie in free space, of the points that no earlier scan could
-    see, and of the earlier points that the scan looks through.
-    """
+    see, and of the earlier points that the scan looks through."""
 
     in_free_space: Tensor
     unknown: Tensor
@@ -434,8 +419,8 @@ class FreeSpace:
     """
 
     def __init__(self, points: Sequence[Tensor], poses: Pose) -> None:
-        images = [range_image(one) for one in points]
-        self._nearest, self._farthest = (torch.stack(part) for part in zip(*images, strict=True))
+        images = zip(*map(range_image, points), strict=True)
+        self._nearest, self._farthest = map(torch.stack, images)
         self._inverse = poses.inverse()
         some = [one[:: math.ceil(len(one) / _KEPT_POINTS) or 1] for one in points]
         self._points = torch.cat([poses[row].apply(part) for row, part in enumerate(some)])
@@ -470,8 +455,7 @@ def _counted(
     points: Tensor, motions: Pose, images: tuple[Tensor, Tensor], frames: Pose
 ) -> tuple[Tensor, Tensor]:
     """Numbers (B,) of points (N, D) under each motion in front of the surface of any of K range images
-    (K, C), and of those that no image shows. frames: (K), image ← world.
-    """
+    (K, C), and of those that no image shows. frames: (K), image ← world."""
     if is_fused(points, *motions.parts, *images, *frames.parts):
         limits = _IMAGE_CELL[motions.dim], *MARGIN
         return range_views(points, motions.parts, frames.parts, images, _size(motions.dim), limits)

@@ -59,8 +59,7 @@ class _Closure(NamedTuple):
 
 class Doubts(NamedTuple):
     """What may be wrong in a trajectory in 2D: rows of keyframes whose motion from the one before may be, in
-    order; rows of those whose own pose may be; and points of scans that were lost, by number.
-    """
+    order; rows of those whose own pose may be; and points of scans that were lost, by number."""
 
     motions: Sequence[int]
     keyframes: Sequence[int]
@@ -108,12 +107,10 @@ def closed(
 
 
 class _Revision:
-    """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans.
-
-    A motion is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and
-    this is likelier by far than all other poses. A pose is replaced, in the same way, by that in the map of
-    the keyframes on both sides.
-    """
+    """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans. A motion
+    is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and this is
+    likelier by far than all other poses. A pose is replaced, in the same way, by that in the map of the
+    keyframes on both sides."""
 
     def __init__(
         self,
@@ -151,26 +148,25 @@ class _Revision:
             self.poses = optimised(poses, self.edges, with_covariances=False).poses
 
     def _join(self, groups: Sequence[Sequence[int]]) -> bool:
-        """Moves the last group to where its first scans lie in the map of the first group's last ones, if
-        that is sure; returns whether it is."""
+        """Moves the last group into the map of the first one's last scans, if that is sure; whether it is."""
         old, new = groups[0][-2 * _NEIGHBOURS - 1 :], groups[-1][:_TOGETHER]
         if min(len(old), len(new)) < _FEWEST:
             return False
         reach = self._max_step * min(new[0] - old[-1], 2)
-        found = self._local(old).placed([self._frame(one) for one in new], self.poses[[old[-1]]], reach)
-        pose, before = Pose.from_matrix(found.locations[0].pose), self.poses[new[0]]
+        scans = [self._frame(one) for one in new]
+        locations, is_sure = self._local(old).placed(scans, self.poses[[old[-1]]], reach)
+        pose, before = Pose.from_matrix(locations[0].pose), self.poses[new[0]]
         row = self._numbers.index(new[0])
         is_elsewhere = _is_beyond(before.inverse() @ pose, _ELSEWHERE)
-        if found.is_sure and (is_elsewhere or self._parts[row] != self._parts[row - 1]):
+        if is_sure and (is_elsewhere or self._parts[row] != self._parts[row - 1]):
             moved = pose @ before.inverse() @ self.poses[new[0] :]
             self.poses = Pose.cat([self.poses[: new[0]], moved])
-            self._replace(old[-1], new[0], found.locations)
-        return found.is_sure
+            self._replace(old[-1], new[0], locations)
+        return is_sure
 
     def place(self, doubts: Doubts) -> set[int]:
         """Places lost scans and doubtful keyframes in the map of the keyframes on both sides of each; returns
-        the numbers of those that lie there for sure.
-        """
+        the numbers of those that lie there for sure."""
         numbers, found = self._numbers, set[int]()
         if not numbers:
             return found
@@ -188,13 +184,13 @@ class _Revision:
             near = [one for one in mates if one != number]
             if len(near) < 2:
                 continue
-            placed = self._local(near).placed([scan], self.poses[[last]], 2 * self._max_step)
-            pose = Pose.from_matrix(placed.locations[0].pose)
-            if not placed.is_sure or not placed.locations[0].found:
+            (location,), is_sure = self._local(near).placed([scan], self.poses[[last]], 2 * self._max_step)
+            if not is_sure or not location.found:
                 continue
             found.add(number)
+            pose = Pose.from_matrix(location.pose)
             if number in doubts.lost or _is_beyond(scan.pose.inverse() @ pose, _ELSEWHERE):
-                self._set(number, last, pose, information_of(placed.locations[0]))
+                self._set(number, last, pose, information_of(location))
         return found
 
     def _set(self, number: int, last: int, pose: Pose, information: Tensor) -> None:
@@ -287,10 +283,8 @@ class LoopCloser:
         return n > _APART and n % _SPACING == 1
 
     def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Pose | None:
-        """Corrected poses (K) of K keyframes if the newest one closes a loop, otherwise None.
-
-        edges: of odometry, between successive keyframes.
-        """
+        """Corrected poses (K) of K keyframes if the newest one closes a loop, otherwise None. edges: of
+        odometry, between successive keyframes."""
         poses = Pose.stack([frame.pose for frame in keyframes])
         pairs = _candidates(poses.translation, [len(keyframes) - 1])
         places = list(enumerate(keyframes))
@@ -302,8 +296,10 @@ class LoopCloser:
             return None
         new_ones = [found] if self.closures and self.closures[-1] is last else [last, found]
         self.closures += new_ones
-        if not any(_is_noticed(poses, closure) for closure in new_ones):
-            return None
+        between = [poses[one.source].inverse() @ poses[one.target] for one in new_ones]
+        off = [one.motion.inverse() @ motion for one, motion in zip(new_ones, between, strict=True)]
+        if not any(_is_beyond(motion, _NOTICED) for motion in off):
+            return None  # the poses agree with them
         return optimised(poses, edges.joined(_edges(self.closures)), with_covariances=False).poses
 
 
@@ -312,12 +308,6 @@ def _agree(poses: Pose, last: _Closure, now: _Closure) -> bool:
     before = poses[now.source].inverse() @ poses[last.source]
     after = poses[last.target].inverse() @ poses[now.target]
     return not _is_beyond(now.motion.inverse() @ before @ last.motion @ after, _AGREE)
-
-
-def _is_noticed(poses: Pose, closure: _Closure) -> bool:
-    """Whether the poses disagree with a closure."""
-    between = poses[closure.source].inverse() @ poses[closure.target]
-    return _is_beyond(closure.motion.inverse() @ between, _NOTICED)
 
 
 def _is_beyond(motion: Pose, limits: tuple[float, float]) -> bool:
@@ -336,11 +326,9 @@ def _edges(closures: Sequence[_Closure]) -> Edges:
 def _candidates(
     at: Tensor, rows: Sequence[int] | None = None, parts: Tensor | None = None
 ) -> list[tuple[int, int]]:
-    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
-
-    at: positions (K, D) of the keyframes. rows: new ones; None: every third. parts: (K,), see `closed`: of
-    other parts, keyframes may be nearer in time, but a part of one or two is no map to search in.
-    """
+    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest. at:
+    positions (K, D) of the keyframes. rows: new ones; None: every third. parts: (K,), see `closed`: of other
+    parts, keyframes may be nearer in time, but a part of one or two is no map to search in."""
     if not len(at):
         return []
     path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)

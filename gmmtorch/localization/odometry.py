@@ -356,9 +356,7 @@ class Odometry:
             self._search_again(lost[0])
 
     def _search_again(self, scan: Keyframe) -> None:
-        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
-        in a row none is searched for: the pose that ends them is less sure.
-        """
+        """The last scan but one, if it alone was lost, between the poses on both sides of it."""
         if self._local is None or len(scan.points) < _FEWEST:
             return
         number, last = len(self._poses) - 2, self._last_frame
@@ -488,8 +486,7 @@ def with_odometry(
 
 def _motion(source: Dataset, turns: Tensor | None, before: int, now: int) -> Tensor | None:
     """The motion of the sensor between two scans, by the poses of the data set, or its rotation by `turns`
-    (N, D, D) since the scan before; None if it is unknown.
-    """
+    (N, D, D) since the scan before; None if it is unknown."""
     if turns is not None:
         turn = functools.reduce(torch.matmul, turns[before + 1 : now + 1])
         return turn if bool(turn.isfinite().all()) else None
@@ -536,10 +533,8 @@ class KissIcp:
         self._locations: list[Location] = []
 
     def add(self, points: Tensor, *unused: object, seconds: object = None) -> Location:
-        """The pose of the next scan in the frame of the first one, without a covariance (NaN).
-
-        The other arguments of `Odometry.add` are not used.
-        """
+        """The pose of the next scan in the frame of the first one, without a covariance (NaN). The other
+        arguments of `Odometry.add` are not used."""
         dim = points.shape[1]
         rows = torch.nn.functional.pad(points, (0, 3 - dim))
         if len(rows):

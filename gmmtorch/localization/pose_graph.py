@@ -34,8 +34,7 @@ _COLUMNS = 256  # of the inverse at a time
 class Edges(NamedTuple):
     """E measured motions: source, target (E,); motions (E), source ← target; information (E, F, F), the
     inverse covariance of a shift (m) and a turn (rad) in the frame of the target; and whether an edge is a
-    closure (E,), which may be wrong.
-    """
+    closure (E,), which may be wrong."""
 
     source: Tensor
     target: Tensor
@@ -58,10 +57,9 @@ class Edges(NamedTuple):
 
 
 class OptimisedPoses(NamedTuple):
-    """Poses (N), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the
-    frame of the sensor, zero for the first pose, NaN if they were not asked for; weight (E,) of each edge,
-    near 0 for a rejected closure; and whether the last step was small.
-    """
+    """Poses (N), world ← sensor; covariances (N, F, F) of a shift (m) and a turn (rad) in the frame of the
+    sensor, zero for the first pose, NaN if they were not asked for; weight (E,) of each edge, near 0 for a
+    rejected closure; and whether the last step was small."""
 
     poses: Pose
     covariances: Tensor

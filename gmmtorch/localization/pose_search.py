@@ -54,10 +54,9 @@ _TOLD_APART = 0.3, math.radians(8)  # metres and radians between poses that are 
 
 
 class Expectation(NamedTuple):
-    """Where a scan is expected: poses (B), world ← sensor; the standard deviations of the first one
-    (m, rad); the share of its points that is usually explained; and the largest shift (m) and turn (rad) from
-    the nearest of the poses.
-    """
+    """Where a scan is expected: poses (B), world ← sensor; the standard deviations of the first one (m, rad);
+    the share of its points that is usually explained; and the largest shift (m) and turn (rad) from the
+    nearest of the poses."""
 
     poses: Pose
     distance: float
@@ -78,8 +77,7 @@ class Expectation(NamedTuple):
 
     def against(self, shift: Tensor, turned: Tensor) -> Tensor:
         """Nats (N,) by shifts (N, B) and turns (N, B). Far from an expected pose the nats grow with the
-        logarithm of the deviation: a robot that stops or turns does not follow any prediction.
-        """
+        logarithm of the deviation: a robot that stops or turns does not follow any prediction."""
         is_near = (shift <= self.max_step) & (turned <= self.max_turn + _ROUNDING)
         square = (shift / self.distance).square() + (turned / self.angle).square()
         nats = _TAIL * torch.log1p(square.amin(1) / (2 * _TAIL))
@@ -287,8 +285,7 @@ def _most(bound: Tensor, least: float, most: int) -> Tensor:
 
 def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor | None = None) -> Tensor:
     """The segments (B, 2, D) of free space from origins to the ends of beams (B, D): the part of each before
-    the margin of its surface, but all of a beam that `is_empty` (B,), because it met no surface.
-    """
+    the margin of its surface, but all of a beam that `is_empty` (B,), because it met no surface."""
     beams = ends - origins
     ranges = beams.norm(dim=1, keepdim=True).clamp_min(1e-9)
     part = (1 - MARGIN[0] / ranges - MARGIN[1]).clamp_min(0)

@@ -58,8 +58,7 @@ _MOST_CONTRADICTED = 1.5  # times the share that need not be explained
 
 class _Search(NamedTuple):
     """The first level; the starts; the share of explained points that ends the search; and how many starts
-    are climbed.
-    """
+    are climbed."""
 
     level: int
     starts: Pose
@@ -114,14 +113,9 @@ class Tracker:
         self._mixture = centered = mixture._replace(means=mixture.means - self._center)
         seen = surfaces.components() if isinstance(surfaces, GaussianMap) else surfaces
         self._seen = seen if isinstance(seen, Components) else None
-        normals = (
-            torch.zeros_like(centered.means) if self._seen is None else alignment.seen_normals(self._seen)
-        )
-        self._targets = [
-            AlignmentTarget(merged, blur, faces)
-            for blur in _BLURS
-            for merged, faces in (alignment.merged_below(centered, normals, blur),)
-        ]
+        faces = torch.zeros_like(centered.means) if self._seen is None else alignment.seen_normals(self._seen)
+        merged = [(blur, *alignment.merged_below(centered, faces, blur)) for blur in _BLURS]
+        self._targets = [AlignmentTarget(kept, blur, normals) for blur, kept, normals in merged]
         self._places = mixture.means[:0] if self._seen is None else _places(self._seen, self._center)
         self.restart(pose)
 
@@ -216,10 +210,8 @@ class Tracker:
 
     def _tilts(self, cloud: Tensor) -> tuple[Tensor, Tensor]:
         """Axes (A, 3) of the sensor, and the axis (A, 3) of the map to which each may be turned. The first
-        `_LIKELY` are those of a sensor that is held about upright.
-
-        Most of the flat area of a scan is parallel to most of that of the map, or perpendicular to it.
-        """
+        `_LIKELY` are those of a sensor that is held about upright. Most of the flat area of a scan is
+        parallel to most of that of the map, or perpendicular to it."""
         up = self._center.new_tensor([0.0, 0.0, 1.0])
         main = up if self._main is None else self._main * (1 - 2 * (self._main[2] < 0))
         ones = torch.ones(len(cloud)).to(cloud)
@@ -276,11 +268,9 @@ class Tracker:
 
     def _location(self, rows: Tensor, found: Alignment, is_tracked: bool) -> Location:
         covariance, deviation = pose_covariance(found.information[0], rows)
-        loosest = float(deviation)
-        doubts = []
+        share, loosest, doubts = float(found.explained[0]), float(deviation), []
         if not bool(found.converged[0]):
             doubts.append("the last step was longer than the tolerance")
-        share = float(found.explained[0])
         if share < self.least_explained:
             doubts.append(f"only {share:.0%} of the points lie on surfaces: another place, or a changed one")
         if loosest > _LOOSEST:

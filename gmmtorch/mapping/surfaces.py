@@ -49,12 +49,9 @@ def surface_mixture(given: Surfaces, name: str) -> Parameters:
         solid = ~given.max_range
         parts = given.means[solid], given.covariances[solid], given.support[solid]
     elif isinstance(given, tuple) and len(given) == 3:
-        names = ("means", "covariances", "weights")
-        means, covariances, weights = (
-            as_tensor(part, f"{part_name} of {name}", torch.float64).detach()
-            for part, part_name in zip(given, names, strict=True)
-        )
-        parts = means, covariances, weights
+        named = zip(given, ("means", "covariances", "weights"), strict=True)
+        found = [as_tensor(part, f"{field} of {name}", torch.float64).detach() for part, field in named]
+        parts = found[0], found[1], found[2]
     else:
         raise InvalidArgumentError(
             f"{name} is a {type(given).__name__}; give a GaussianMap, Components, or a tuple "
@@ -312,10 +309,8 @@ class Body:
         Differentiable in the poses: the gradient moves a path away from surfaces.
         """
         balls = self._placed(poses)
-        gaps = clearance(surfaces, balls.flatten(0, 1), deviations, least_density).unflatten(
-            0, balls.shape[:2]
-        )
-        return (gaps - self.radii.to(gaps)).amin(1)
+        gaps = clearance(surfaces, balls.flatten(0, 1), deviations, least_density)
+        return (gaps.unflatten(0, balls.shape[:2]) - self.radii.to(gaps)).amin(1)
 
     def collision_probability(self, surfaces: Surfaces, poses: ArrayLike) -> Tensor:
         """Probability (S,) that the body at each pose touches a return of the map.

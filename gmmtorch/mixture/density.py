@@ -24,12 +24,10 @@ from gmmtorch.mixture.em import exact as em
 from gmmtorch.mixture.em.exact import Parameters, compact, count_free_entries, expand
 from gmmtorch.mixture.validation import Array, RandomState, as_generator, checked_tensor
 
-_JOINTS: WeakKeyDictionary[MixtureDensity, tuple[list[tuple[Tensor, int]], by_type.Joint]] = (
-    WeakKeyDictionary()
-)
-"""The log-densities of mixtures, with the parameters that they are of and the versions of these tensors.
-
-They are apart from the mixtures, because queries may not change an estimator's attributes."""
+Known = tuple[list[tuple[Tensor, int]], by_type.Joint]
+_JOINTS: WeakKeyDictionary[MixtureDensity, Known] = WeakKeyDictionary()
+"""The log-densities of mixtures, with the parameters that they are of and their versions; apart from the
+mixtures, because queries may not change an estimator's attributes."""
 
 Self = TypeVar("Self", bound="MixtureDensity")
 
@@ -134,8 +132,7 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
     def sample(self, n_samples: int = 1, random_state: RandomState = None) -> tuple[Array, Array]:
         """Draw points (n, D) and their components (n,), ordered by component.
 
-        `random_state` defaults to that of the estimator. If that is a seed, every call returns the
-        same samples.
+        `random_state` defaults to that of the estimator; of a seed, every call returns the same samples.
         """
         means = self._fitted()
         if not isinstance(n_samples, int | np.integer) or n_samples < 1:

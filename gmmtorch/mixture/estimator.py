@@ -38,10 +38,8 @@ from gmmtorch.pose import Pose
 
 
 class Report:
-    """Receives the bounds of one start, prints every `interval`-th iteration, and passes all bounds on.
-
-    verbose: 0 prints nothing, 1 the iterations, 2 also the seconds and the change of the bound.
-    """
+    """Passes the bounds of one start on, and prints every `interval`-th iteration if `verbose`; if 2, with
+    seconds and the change of the bound."""
 
     def __init__(self, start: int, verbose: int, interval: int, on_iteration: OnIteration | None) -> None:
         self._verbose, self._interval, self._pass_on = verbose, interval, on_iteration
@@ -62,12 +60,11 @@ class Report:
 
     def end(self, found: EMResult[Any]) -> None:
         """Prints whether the start converged."""
-        if not self._verbose:
-            return
-        seconds = time.monotonic() - self._begin
-        state = "converged" if found.converged else "did not converge"
-        details = f" time lapse {seconds:.5f}s\t lower bound {found.lower_bound:.5f}."
-        print(f"Initialization {state}.{details if self._verbose > 1 else ''}")
+        if self._verbose:
+            seconds = time.monotonic() - self._begin
+            details = f" time lapse {seconds:.5f}s\t lower bound {found.lower_bound:.5f}."
+            state = "converged" if found.converged else "did not converge"
+            print(f"Initialization {state}.{details if self._verbose > 1 else ''}")
 
 
 _FILE_KIND, _FILE_VERSION = "gmmtorch.mixture", 1
@@ -190,11 +187,7 @@ class MixtureEstimator(MixtureDensity):
         return self
 
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
-        """Fit the mixture to a prepared cloud and store the result with `_store_fit`.
-
-        Only `fit` of this class calls it. It is not abstract, because a subclass with a `fit` of its own has
-        none.
-        """
+        """Fit the mixture to a prepared cloud and store the result with `_store_fit`."""
         raise NotImplementedError(f"{type(self).__name__} must define _learn, or a fit of its own.")
 
     def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
@@ -204,11 +197,8 @@ class MixtureEstimator(MixtureDensity):
     # -- steps that every fit begins and ends with ------------------------------------------------
 
     def _prepare(self, X: Array, sample_weight: Array | None, reset: bool = True) -> Cloud:
-        """The checked points of non-zero weight, relative to their weighted mean.
-
-        Without `reset` the points extend an earlier fit: D must match, and there may be fewer points
-        than components.
-        """
+        """The checked points of non-zero weight, relative to their weighted mean. Without `reset` they extend
+        an earlier fit: D must match, and there may be fewer points than components."""
         self.check_parameters()
         points = self._as_points(X, reset=reset).detach()
         warn_if_coarse(X, points)
@@ -259,9 +249,7 @@ class MixtureEstimator(MixtureDensity):
         self, run: Callable[[OnIteration], EMResult[State]], on_iteration: OnIteration | None
     ) -> EMResult[State]:
         """The result with the largest bound of `n_init` starts, or of the one that continues the last fit.
-
-        `run` makes one start and passes the bounds on. Raises `NumericalError` if a component collapses.
-        """
+        `run` makes one start and passes the bounds on. Raises `NumericalError` if a component collapses."""
         best: EMResult[State] | None = None
         verbose, interval = int(getattr(self, "verbose", 0)), int(getattr(self, "verbose_interval", 10))
         for start in range(1 if self._continues() else self.n_init):
@@ -277,16 +265,10 @@ class MixtureEstimator(MixtureDensity):
         return best
 
     def _warn_unless_converged(self) -> None:
-        """Warn the caller of `fit` that it stopped at `max_iter`.
-
-        With tol=0 or max_iter=0 that is intended, so no warning.
-        """
+        """Warn the caller of `fit` that it stopped at `max_iter`; with tol=0 or max_iter=0 it is meant to."""
         if not self.converged_ and self.tol > 0 and self.max_iter > 0:
-            warnings.warn(
-                f"{_NOT_CONVERGED} (max_iter={self.max_iter}, tol={self.tol:g})",
-                ConvergenceWarning,
-                stacklevel=3,
-            )
+            reason = f"{_NOT_CONVERGED} (max_iter={self.max_iter}, tol={self.tol:g})"
+            warnings.warn(reason, ConvergenceWarning, stacklevel=3)
 
     @classmethod
     def from_parameters(
@@ -326,8 +308,7 @@ class MixtureEstimator(MixtureDensity):
             raise NumericalError(
                 f"covariances has {float(covariance.min()):.3g}; variances must be above zero."
             )
-        mixture._tensors = isinstance(means, Tensor)
-        mixture.n_features_in_ = dim
+        mixture._tensors, mixture.n_features_in_ = isinstance(means, Tensor), dim
         mixture._set_history(lower_bounds, converged)
         mixture._set_buffers(weight, mean, covariance)
         mixture._set_extra({})
@@ -346,11 +327,8 @@ class MixtureEstimator(MixtureDensity):
         return {name: getattr(self, name) for name in self._extra_names if name in self._buffers}
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
-        """Replace the extra tensors. Called after the weights, means and covariances are set.
-
-        The tensors may come from a file or a state dict, so a subclass checks them first and raises
-        `InvalidArgumentError`. An empty mapping is valid: a mixture of given parameters has none.
-        """
+        """Replace the extra tensors, after the weights, means and covariances are set. They may come from a
+        file or a state dict, so a subclass checks them first. A mixture of given parameters has none."""
         for name in self._extra_names:
             self._buffers.pop(name, None)
             if name in tensors:

@@ -130,8 +130,7 @@ class GaussianMixture(MixtureEstimator):
 
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
         points, weight, center = cloud
-        rows = self._rows(points, weight)
-        generator = as_generator(self.random_state)
+        rows, generator = self._rows(points, weight), as_generator(self.random_state)
         fused = iter(self._small_runs(rows, center, generator))
 
         def run(report: OnIteration) -> EMResult[Parameters]:
@@ -242,25 +241,23 @@ class GaussianMixture(MixtureEstimator):
         """EM from one start, or from what is known of it."""
         reg, dtype = float(self.reg_covar), em.SOFTMAX_DTYPES[self.dtype]
         if known is None:
-            (first,), owner = self._starts(rows, center, generator)
+            start, owner = self._starts(rows, center, generator)
         else:
-            first, owner = known.parameters, None
+            start, owner = [known.parameters], None
             for iteration, bound in enumerate(known.lower_bounds, 1):
                 on_iteration(iteration, bound)
-        if not self._truncates(rows.weight.shape[0], *first.means.shape):
-            start = [first]
-            del first  # which may be most of the memory
+        if not self._truncates(rows.weight.shape[0], *start[0].means.shape):
             return loop.run_em(
                 loop.em_step(rows, reg, dtype, self.covariance_type),
-                start.pop(),
+                start.pop(),  # which may be most of the memory
                 tol=self.tol,
                 max_iter=self.max_iter,
                 on_iteration=on_iteration,
                 lower_bounds=known.lower_bounds if known else (),
                 previous_bound=self._previous_bound(),
             )
-        owner = nearest(rows.points, first.means) if owner is None else owner
-        return fit_truncated(rows, owner, first, self._settings(on_iteration))
+        owner = nearest(rows.points, start[0].means) if owner is None else owner
+        return fit_truncated(rows, owner, start[0], self._settings(on_iteration))
 
     def _settings(self, on_iteration: OnIteration | None, processes: Processes = SINGLE_PROCESS) -> Settings:
         """The settings of truncated EM."""
@@ -328,9 +325,9 @@ class GaussianMixture(MixtureEstimator):
     def _current_parameters(self, points: Tensor, center: Tensor) -> Parameters:
         """The current parameters, in the centred frame."""
         self._check_continues(points)
-        means = self.means.to(points.device) - center
-        covariances = self._typed_covariances().to(points.device)
-        return Parameters(self.weights.to(points.device), means, covariances)
+        given = self.weights, self.means, self._typed_covariances()
+        weights, means, covariances = (value.to(points.device) for value in given)
+        return Parameters(weights, means - center, covariances)
 
     # -- arguments --------------------------------------------------------------------------------
 

@@ -91,7 +91,7 @@ def simplify(
     weights, means, covariances = _checked(parameters)
     if n_components is None and max_cost is None:
         raise InvalidArgumentError("n_components=None and max_cost=None: give at least one as the limit.")
-    min_components = 1 if n_components is None else check_whole("n_components", n_components, 1)
+    least = 1 if n_components is None else check_whole("n_components", n_components, 1)
     limit: object = math.inf if max_cost is None else max_cost
     if not isinstance(limit, numbers.Real) or not float(limit) >= 0:
         raise InvalidArgumentError(f"max_cost={max_cost!r} must be a number of at least 0.")
@@ -103,10 +103,10 @@ def simplify(
     columns = torch.cat([means, pack_symmetric(covariances), weights[:, None]], 1).cpu().numpy()
     order = torch.from_numpy(np.lexsort(columns.T[::-1])).to(means.device)
     given = Parameters(weights[order], means[order], covariances[order])
-    found = merge_in_rounds(given, max(min_components, exact), float(limit), cost, neighbors)
+    found = merge_in_rounds(given, max(least, exact), float(limit), cost, neighbors)
     left, labels = Gaussians.of(found.parameters), found.labels
     if left.weights.shape[0] <= exact:
-        left, merged = _merge_greedily(left, min_components, float(limit), COSTS[cost])
+        left, merged = _merge_greedily(left, least, float(limit), COSTS[cost])
         labels = merged[labels]
     bound = given.weights @ (left.half_log_dets[labels] - Gaussians.of(given).half_log_dets)
     labels, kept = _in_order_given(torch.empty_like(labels).scatter_(0, order, labels), left.weights.shape[0])
@@ -212,11 +212,8 @@ def _pair_costs(state: Gaussians, i: Tensor, j: Tensor, cost: Cost) -> Tensor:
 
 
 def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
-    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once.
-
-    If more means coincide than the neighbour search returns, it finds only some of them. Each row at the
-    place of the next one is therefore also paired with that one.
-    """
+    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once. Each row at the place of the
+    next one is also paired with that one: the neighbour search finds only some of many equal means."""
     from scipy.spatial import cKDTree
 
     k, device = means.shape[0], means.device
@@ -232,10 +229,7 @@ def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
 
 
 def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The pairs i, j (P,) in which each component is the other's cheapest partner, the cheapest pair first.
-
-    No component occurs in two of these pairs, and the cheapest of all pairs is one of them.
-    """
+    """The pairs i, j (P,) in which each component is the other's cheapest partner, cheapest first."""
     # Of pairs with equal costs, any order will do but that of rows, in which each blocks the next one.
     order = (((i << 32) + j) * _SPREAD).argsort()
     order = order[costs[order].argsort(stable=True)]
@@ -251,10 +245,8 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
 
 
 def parameters_of(mixture: Parameters | MixtureEstimator, name: str) -> Parameters:
-    """Parameters of a mixture or of a fitted estimator, as tensors without gradients.
-
-    Raises `InvalidArgumentError` for anything else, `NotFittedError` for an estimator without parameters.
-    """
+    """Parameters of a mixture or of a fitted estimator, as tensors without gradients. Raises
+    `InvalidArgumentError` for anything else, `NotFittedError` for an estimator without parameters."""
     check_fitted = getattr(mixture, "_fitted", None)
     if check_fitted is not None:
         check_fitted()
@@ -346,8 +338,7 @@ def merge(
     )
     if n_components is not None or max_cost is not None:
         union = simplify(union, n_components, max_cost, cost, neighbors).parameters
-    weights, means, covariances = union
-    values = (weights / weights.sum(), means, covariances)
+    values = (union.weights / union.weights.sum(), *union[1:])
     arrays = (value.cpu().numpy() for value in values)
     found = GaussianMixture.from_parameters(*(values if isinstance(a.means_, Tensor) else arrays), **options)
     found.n_samples_seen_ = total
@@ -391,22 +382,16 @@ def merge_components(
 
 
 def merge_pairs(first: Parameters, second: Parameters) -> Parameters:
-    """Merge each component of `first` (P of them) with the component of `second` in the same row.
-
-    Without cancellation: with a = w₁/w and b = w₂/w, Σ = a Σ₁ + b Σ₂ + ab (μ₁ − μ₂)(μ₁ − μ₂)ᵀ. If both
-    weights are zero, both components count equally.
-    """
+    """Merge each component of `first` (P of them) with the component of `second` in the same row. Without
+    cancellation: with a = w₁/w and b = w₂/w, Σ = a Σ₁ + b Σ₂ + ab (μ₁ − μ₂)(μ₁ − μ₂)ᵀ. If both weights are
+    zero, both components count equally."""
     weight = first.weights + second.weights
     b = torch.where(weight > 0, second.weights / weight, 0.5)[:, None]
     offset = second.means - first.means
     mean = first.means + b * offset
     scatter = (1 - b)[:, None] * b[:, None] * offset[:, :, None] * offset[:, None, :]
-    return Parameters(
-        weight, mean, (1 - b)[:, None] * first.covariances + b[:, None] * second.covariances + scatter
-    )
-
-
-# -- costs ------------------------------------------------------------------------------------------
+    within = (1 - b)[:, None] * first.covariances + b[:, None] * second.covariances
+    return Parameters(weight, mean, within + scatter)
 
 
 class Gaussians(NamedTuple):
@@ -451,10 +436,8 @@ def kullback_leibler_bound(first: Gaussians, second: Gaussians) -> Tensor:
 
 
 def squared_hellinger(first: Gaussians, second: Gaussians) -> Tensor:
-    """H² = 1 − |Σ₁|^¼ |Σ₂|^¼ |Σ|^−½ exp(−⅛ (μ₁−μ₂)ᵀ Σ⁻¹ (μ₁−μ₂)), Σ = ½(Σ₁+Σ₂), (P,).
-
-    0 for equal Gaussians, 1 for Gaussians without overlap. Weights have no effect.
-    """
+    """H² = 1 − |Σ₁|^¼ |Σ₂|^¼ |Σ|^−½ exp(−⅛ (μ₁−μ₂)ᵀ Σ⁻¹ (μ₁−μ₂)), Σ = ½(Σ₁+Σ₂), (P,). 0 for equal Gaussians,
+    1 for Gaussians without overlap. Weights have no effect."""
     factors = safe_cholesky((first.covariances + second.covariances) / 2)
     offset = (first.means - second.means)[:, :, None]
     squared = torch.linalg.solve_triangular(factors, offset, upper=False).square().sum((1, 2))

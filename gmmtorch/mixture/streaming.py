@@ -204,10 +204,7 @@ def _stream_step(
     e_step: EStep | None,
     n_points: int,
 ) -> loop.Step[Parameters]:
-    """EM steps on the points of all processes, relative to `center` (D,).
-
-    Each process sums over its chunks, then all sum once.
-    """
+    """EM steps on the points of all processes, relative to `center` (D,)."""
 
     def centered() -> Iterator[tuple[Tensor, Tensor]]:
         # Zeros first, for a process without points.
@@ -218,7 +215,7 @@ def _stream_step(
 
     def summed(terms: Iterator[tuple[Tensor, ...]]) -> list[Tensor]:
         """The sums of the tensors of all terms, over all chunks and processes."""
-        sums = next(terms)
+        sums = next(terms)  # of this process
         for term in terms:
             sums = tuple(a + b for a, b in zip(sums, term, strict=True))
         packed = processes.sum(torch.cat([part.flatten() for part in sums]))
@@ -276,12 +273,10 @@ def survey_all(
         return part
     counts = part.total.new_tensor([part.n_points, part.n_dropped, part.checksum])  # whole numbers below 2⁵³
     facts = processes.gather(torch.cat([counts, part.total, part.low, part.high])[None])
-    samples = processes.gather(part.sample)
-    dim = source.dim
     parts = []
-    for row, sample in zip(torch.cat(facts), samples, strict=True):
-        n_points, n_dropped, checksum = (int(value) for value in row[:3])
-        total, low, high = row[3:].split(dim)
+    for row, sample in zip(torch.cat(facts), processes.gather(part.sample), strict=True):
+        n_points, n_dropped, checksum = map(int, row[:3])
+        total, low, high = row[3:].split(source.dim)
         parts.append(Survey(n_points, n_dropped, total, low, high, checksum, sample))
     return merge_surveys(parts, sample_points)
 
@@ -309,10 +304,7 @@ def first_state(
 
 
 def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts:
-    """Description of the run, with the `repr` of its E-step.
-
-    Excludes `tol` and `max_iter`, which only determine when the run ends.
-    """
+    """Description of the run, with the `repr` of its E-step; `tol` and `max_iter` only say when it ends."""
     seed = mixture.random_state
     given: tuple[Any, ...] = (mixture.weights_init, mixture.means_init, mixture.precisions_init)
     if mixture._continues():
@@ -340,8 +332,7 @@ def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts
 
 class State(NamedTuple):
     """Parameters relative to `center` (D,), with covariances in the shape of their type, and the lower bounds
-    (nats) of the iterations so far.
-    """
+    (nats) of the iterations so far."""
 
     parameters: Parameters
     center: Tensor

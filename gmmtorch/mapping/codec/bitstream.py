@@ -54,8 +54,7 @@ def _shortest_code(values: Ints) -> tuple[int, int, int]:
 
 
 def _rice_code(values: Ints) -> tuple[int, float]:
-    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits: a float, which does not
-    overflow."""
+    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits."""
     n = len(values)
     if not n:
         return 0, 0.0
@@ -176,11 +175,11 @@ class BitReader:
                 rows[:] = (bits << _shifts(widths)).sum(1)
                 continue
             block = widths[begin : begin + _BLOCK]
-            which, shift = _bit_places(block)
-            bits = self._next(len(which)) << shift
-            wide = np.flatnonzero(block)
+            wide, ends = np.flatnonzero(block), np.cumsum(block)
             if len(wide):
-                values[begin + wide] = np.add.reduceat(bits, (np.cumsum(block) - block)[wide])
+                exponents = np.repeat(ends, block) - 1 - np.arange(ends[-1])  # of the bits, highest first
+                bits = self._next(int(ends[-1])) << exponents
+                values[begin + wide] = np.add.reduceat(bits, (ends - block)[wide])
         return values
 
     def one(self, width: int) -> int:
@@ -254,12 +253,6 @@ def within(values: Ints, name: str, least: int, largest: int) -> Ints:
     if len(values) and not (int(values.min()) >= least and int(values.max()) <= largest):
         raise DataError(f"The {name} reach from {values.min()} to {values.max()}, not {least} to {largest}.")
     return values
-
-
-def _bit_places(width: Ints) -> tuple[Ints, Ints]:
-    """For each bit of numbers of these widths, highest first: the number's row, and the bit's exponent."""
-    which = np.repeat(np.arange(len(width)), width)
-    return which, np.cumsum(width)[which] - 1 - np.arange(len(which))
 
 
 def _shifts(width: int) -> Ints:

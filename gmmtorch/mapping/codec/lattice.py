@@ -135,12 +135,9 @@ class Lattice:
 
 def nearest(means: Tensor, covariances: Tensor, coarse: bool = False) -> Lattice:
     """The nearest lattice points of means (K, D) and covariances (K, D, D), float64 on the CPU; those of the
-    coarse lattice, if `coarse`.
-
-    Covariances that are not positive definite become so. Raises `InvalidArgumentError`
-    for values beyond `FARTHEST` and `LARGEST_DEVIATION`, also if only their rounding is: the result
-    `is_valid`.
-    """
+    coarse lattice, if `coarse`. Covariances that are not positive definite become so. Raises
+    `InvalidArgumentError` for values beyond `FARTHEST` and `LARGEST_DEVIATION`, also if only their rounding
+    is: the result `is_valid`."""
     if is_fused(means, covariances):
         found = lattice_rounding(means, covariances, _constants(means.shape[1], coarse))
         if found is not None:
@@ -277,9 +274,7 @@ def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor, coarse: boo
 
 
 def _factors(ordered: Tensor) -> tuple[Tensor, Tensor]:
-    """d² (K, D) and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances; d² is at least the smallest of the
-    lattice.
-    """
+    """d² (K, D), at least the smallest of the lattice, and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances."""
     least = 4.0 ** (LEAST_DEVIATION / PER_OCTAVE)
     v1 = ordered[:, 0, 0].clamp_min(least)
     floor = (v1 * 4.0 ** (-LARGEST_RATIO / PER_OCTAVE)).clamp_min(least)

@@ -156,8 +156,7 @@ def mean_range(window: Sequence[Scan | DepthFrame]) -> float:
 
 class PooledFrames(NamedTuple):
     """C cells of the points of S frames: mean features (C, 10) about `center` (3,), number of points (C,),
-    and points of each frame (C, S).
-    """
+    and points of each frame (C, S)."""
 
     features: Tensor
     weight: Tensor
@@ -166,12 +165,9 @@ class PooledFrames(NamedTuple):
 
 
 def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> PooledFrames:
-    """The points of frames, summed into at most `max_cells` cubic cells.
-
-    The cells have side `finest` (m). If that gives too many cells, the side grows in steps of a third of an
-    octave until the limit holds, which must be 8 or more. Raises `InvalidArgumentError` for points that are
-    farther away than a map stores.
-    """
+    """The points of frames, summed into at most `max_cells` cubic cells. The cells have side `finest` (m). If
+    that gives too many cells, the side grows in steps of a third of an octave until the limit holds, which
+    must be 8 or more. Raises `InvalidArgumentError` for points that are farther away than a map stores."""
     rotation, origin = (np.stack([frame.pose.parts[i].numpy() for frame in frames]) for i in (0, 1))
     camera = np.array([frame.camera for frame in frames])
     fx, fy, cx, cy = camera.T[..., None]
@@ -180,22 +176,18 @@ def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> 
     rays, shortest = np.stack([first, across, down, origin - reference], 1), camera[:, :2].min(1)
     depths, max_range = [frame.depth for frame in frames], np.array([frame.max_range for frame in frames])
 
-    def side_of(thirds: int) -> float:
-        return finest * 2 ** (thirds / 3)
-
     def pooled(thirds: int) -> DepthCells | None:
-        side = side_of(thirds)
+        side = finest * 2 ** (thirds / 3)
         return depth_cells(DepthViews(depths, rays / side, 1 / (shortest * side), max_range), side, max_cells)
 
-    first = pooled(0)
-    if first is None:
+    thirds, cells = 0, pooled(0)
+    if cells is None:
         scans = [frame.scan() for frame in frames]  # raises for points that are too far away
         away = [scan.points - scan.points.new_tensor(reference) for scan in scans if len(scan.points)]
         extent = max(float(offsets.abs().max()) for offsets in away)
-        thirds, cells = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / finest + 2)))
-    else:
-        thirds, cells = 0, first
-    side = side_of(thirds)
+        found = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / finest + 2)))
+        thirds, cells = found
+    side = finest * 2 ** (thirds / 3)
     weight = cells.sums[:, 0].contiguous()
     total = (cells.sums[:, 1:4] + weight[:, None] * cells.corners).sum(0)
     center = total / weight.sum().clamp_min(1)
@@ -216,9 +208,7 @@ def whole_frames(
     frames: Sequence[tuple[ArrayLike, ArrayLike]], broken: dict[int, GmmTorchError], *options: Any
 ) -> Iterator[DepthFrame]:
     """Frames (depth, pose) that are not broken; `options` as in `DepthFrame.of`, from the intrinsics on.
-
-    `broken` receives the errors of the others, by their index.
-    """
+    `broken` receives the errors of the others, by their index."""
     for index in range(len(frames)):
         try:
             frame = frames[index]
@@ -281,25 +271,14 @@ def fit_window(scans: Sequence[Scan], fit: SurfaceFit, viewpoints: AssignViewpoi
     origins = torch.stack([scan.origin.double() for scan in scans])
     channels = [scan.attributes for scan in scans]
     returns = fit_points([scan.points for scan in scans], origins, fit, viewpoints, channels)
-    n_free = fit.rule.free_points
     ends = [scan.no_return for scan in scans]
-    if n_free:
-        ends = [torch.cat([scan.no_return, _points_before(scan, n_free)]) for scan in scans]
-    if not any(len(end) for end in ends):
+    if fit.rule.free_points:
+        before = [_points_before(scan, fit.rule.free_points) for scan in scans]
+        ends = [torch.cat(pair) for pair in zip(ends, before, strict=True)]
+    if not any(map(len, ends)):
         return returns
     empty = fit_points(ends, origins, fit, viewpoints, max_range=True)
     return Components.concatenate([returns, empty])
-
-
-def _places_apart(points: Tensor, span: float) -> Tensor | None:
-    """The place (N,) of each point, a cube of side `span` (m) from the lowest corner; None if there is one.
-
-    Wider windows lose digits, because moments are sums of squares of distances.
-    """
-    low, high = points.aminmax(dim=0)
-    if bool((high - low <= span).all()):
-        return None
-    return torch.unique(((points - low) / span).long(), dim=0, return_inverse=True)[1]
 
 
 def fit_points(
@@ -312,16 +291,16 @@ def fit_points(
     max_range: bool = False,
 ) -> Components:
     """Components of S clouds of points (N_s, D), each observed from its sensor origin (S, D), in metres.
-
     `attributes`: the channels of the points of each cloud. `max_range`: the points are ends of no-return
-    beams. Components are not numbered, and on the CPU.
-    """
+    beams. Components are not numbered, and on the CPU."""
     sizes = [cloud.shape[0] for cloud in clouds]
     n_points, dim = sum(sizes), origins.shape[1]
     if n_points == 0:
         return Components.empty(dim)
     points = torch.cat(list(clouds)).double()
-    if (places := _places_apart(points, _WIDEST * fit.noise)) is not None:
+    (low, high), widest = points.aminmax(dim=0), _WIDEST * fit.noise
+    if not bool((high - low <= widest).all()):  # moments are sums of squares: wider windows lose digits
+        places = torch.unique(((points - low) / widest).long(), dim=0, return_inverse=True)[1]
         made = []
         for number in range(int(places.max()) + 1):
             kept = [place == number for place in places.split(sizes)]
@@ -357,11 +336,9 @@ def fit_points(
 
 
 def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
-    """Components of the points of depth images, each observed from its camera; see `fit_points`.
-
-    The images are summed into cells at once, without a list of their points. Components are not numbered,
-    and on the CPU.
-    """
+    """Components of the points of depth images, each observed from its camera; see `fit_points`. The images
+    are summed into cells at once, without a list of their points. Components are not numbered, and on the
+    CPU."""
     origins = torch.stack([frame.pose.translation for frame in frames]).detach()
     is_wide = np.ptp(origins.numpy(), 0).max() > _WIDEST * fit.noise
     if is_wide or fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
@@ -407,9 +384,7 @@ def _points_before(scan: Scan, n: int) -> Tensor:
 
 class _Window(NamedTuple):
     """points (N, D) and origins (S, D), relative to the centre of the points; scan (N,) of each point.
-
-    sensor: for pruning by density.
-    """
+    sensor: for pruning by density."""
 
     points: Tensor
     scan: Tensor
@@ -495,8 +470,8 @@ def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> 
     """The mixture of cells with mean features (N, F) and weights (N,), by EM from flat pieces."""
     means = features[:, 1 : 1 + dim].contiguous()
     moments = (features,) if fit.partition_by_moments else ()
-    pieces = partition(means, weight, fit.flatness, *moments)
+    pieces, n_pieces = partition(means, weight, fit.flatness, *moments)
     smallest_variance = fit.noise**2
-    first = maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
+    first = maximization(pool(features, weight, pieces, n_pieces), smallest_variance)
     step = em_step(Rows(features, weight, are_points=False), smallest_variance, fit.dtype)
     return run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters

@@ -22,6 +22,7 @@ map, see `occupancy.calibrator`.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -138,16 +139,14 @@ def _learned(
         # Scans without a return still show the scale of the sensor by the ends of their beams.
         rule = rule.fitted([Scan(scan.no_return, scan.origin) for scan in scans])
     fit = surface_fit(rule, scans[0].dim)
-    return fit_window(
-        scans, fit if iterations is None else replace(fit, iterations=iterations), merging.all_origins(weight)
-    )
+    fit = fit if iterations is None else replace(fit, iterations=iterations)
+    return fit_window(scans, fit, merging.all_origins(weight))
 
 
 def _explain(
     components: Components, scans: Sequence[Scan], rule: NoveltyRule, weight: float
 ) -> tuple[Components, list[Scan]]:
-    """The components with the counts of the points that they explain, and the novel beams of each scan
-    that no component explains."""
+    """The components with the counts of points that they explain, and the other novel beams of each scan."""
     remaining = []
     for scan in scans:
         novel = scan.select(novel_beams(components, scan, rule))
@@ -198,10 +197,8 @@ def cell_fit(
 
 
 def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
-    """Components of a part of an unfinished window, with which it answers until all of it is learned.
-
-    Those of an `IncrementalRule` are its flat pieces, at most half as many as of a window, without EM.
-    """
+    """Components of a part of an unfinished window, with which it answers until all of it is learned. Those
+    of an `IncrementalRule` are its flat pieces, at most half as many as of a window, without EM."""
     if isinstance(rule, WindowedRule):
         return learn_window(scans, replace(rule, iterations=1), generator)
     quick = replace(rule, window_components=max(1, rule.window_components // 2))
@@ -386,9 +383,7 @@ def _aged(
 
 def gone_log_odds(components: Components, scans: Sequence[Scan], noise: float, log_odds: Tensor) -> Tensor:
     """Log-odds (K,) after the scans that the surfaces of K components are gone; `log_odds` (K,): before them.
-
-    Components of no-return beams must not be among the components. noise: of the sensor, metres.
-    """
+    Components of no-return beams must not be among the components. noise: of the sensor, metres."""
     if len(components) == 0:
         return log_odds
     white, _ = whitening(components.covariances)
@@ -453,16 +448,11 @@ def predicted(
         seen = hits * (calibrator.length / side) + misses
         kept = (seen >= np.sort(seen)[(len(seen) - 1) // 2]) & (seen > 0)
         predictions.append(Prediction(hits[kept], misses[kept], occupied[kept], side))
-    due = number + _windows_between(n_pairs, window)
-    return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
-
-
-def _windows_between(n_pairs: int, window: Sequence[Scan | DepthFrame]) -> int:
-    """Windows from one prediction to the next, so that predictions take a small share of the time."""
     n_points = sum(s.depth.numel() if isinstance(s, DepthFrame) else len(s.points) for s in window)
     predicting = _PREDICTING[0] + _PREDICTING[1] * n_pairs
     learning = _LEARNING[0] + _LEARNING[1] * min(n_points, _MOST)
-    return max(1, round(predicting / (_SHARE * learning)))
+    due = number + max(1, round(predicting / (_SHARE * learning)))
+    return replace(calibrator.updated(predictions, ends.shape[1]), next_window=due)
 
 
 def _beams(window: Sequence[Scan | DepthFrame], generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -501,20 +491,16 @@ def few_points(blocks: Sequence[Block], points: Tensor, sides: Sequence[float]) 
 
 def _near(known: Components, points: Tensor, widest: float, cutoff: float) -> Tensor:
     """The viewpoint (P,) of each pair of a point and a viewpoint whose cone may give evidence to the cube.
-
-    First by boxes around the cones, then by balls around the components. Pairs that they leave out give
-    next to no evidence.
-    """
+    First by boxes around the cones, then by balls around the components. Pairs that they leave out give next
+    to no evidence."""
     extent = cutoff * known.covariances.diagonal(dim1=1, dim2=2).sqrt()
     by, origins = known.seen_by, known.origins[known.seen_from]
     low = torch.minimum((known.means - extent)[by], origins) - widest
     high = torch.maximum((known.means + extent)[by], origins) + widest
     view = ((low <= points.amax(0)) & (high >= points.amin(0))).all(1).nonzero().squeeze(1)
     low, high = low[view], high[view]
-    met = (points[:, :1] >= low[:, 0]) & (points[:, :1] <= high[:, 0])
-    for axis in range(1, known.dim):
-        met &= points[:, axis, None] >= low[:, axis]
-        met &= points[:, axis, None] <= high[:, axis]
+    columns = zip(points.T[..., None], low.T, high.T, strict=True)
+    met = functools.reduce(torch.logical_and, ((x >= first) & (x <= last) for x, first, last in columns))
     point, row = met.nonzero(as_tuple=True)
     view = view[row]
     ray, offset = points[point] - origins[view], points[point] - known.means[by[view]]
@@ -523,8 +509,7 @@ def _near(known: Components, points: Tensor, widest: float, cutoff: float) -> Te
     distance = (offset - ray).square().sum(1)
     # The cube seen from a sensor at range r is as wide as widest · distance / r at the component.
     ball = extent.norm(dim=1)[by[view]] + widest * (distance / square).clamp_min(1).sqrt()
-    close = (offset * offset).sum(1) * square - along * along <= 1.001 * ball * ball * square
-    close = (close & ((along <= 0) | (along * along <= 1.001 * ball * ball * square))) | (
-        square <= widest * widest
-    )
-    return view[close]
+    reach = 1.001 * ball * ball * square
+    is_beside = (offset * offset).sum(1) * square - along * along <= reach
+    is_before = (along <= 0) | (along * along <= reach)
+    return view[is_beside & is_before | (square <= widest * widest)]

@@ -41,11 +41,9 @@ Joint = Callable[..., Tensor]
 
 
 def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
-    """Whether the linear form is the fastest of a covariance type: the one place of this choice.
-
-    For full covariances it was measured: in 50 dimensions, making the D (D + 1)/2 features of a point takes
-    as long as their products with 50 components.
-    """
+    """Whether the linear form is the fastest of a covariance type: the one place of this choice. For full
+    covariances it was measured: in 50 dimensions, making the D (D + 1)/2 features of a point takes as long as
+    their products with 50 components."""
     return kind != "full" or dim <= 20 or dim <= min(n_components, 50)
 
 
@@ -65,10 +63,8 @@ def expanded(parameters: Parameters, kind: str) -> Parameters:
 
 class Factors:
     """Parameters with what their log-densities need: L⁻¹ in the shape of the type, and log-constants (K,).
-
-    With `check`, covariances that are not positive definite raise `NumericalError`. Without it, nothing
-    waits for the device, and `failed` () tells.
-    """
+    With `check`, covariances that are not positive definite raise `NumericalError`. Without it, nothing waits
+    for the device, and `failed` () tells."""
 
     def __init__(self, parameters: Parameters, kind: str, check: bool = True) -> None:
         self.weights, self.means, covariances = parameters
@@ -103,8 +99,7 @@ class Factors:
 
     def lost_digits(self) -> Tensor:
         """Whether the linear form loses too many digits near a component, (). Far from all components its
-        error is small beside the log-density.
-        """
+        error is small beside the log-density."""
         size = self.whitened_means().square().sum(1) * self.weights.sign()
         return size.amax() * torch.finfo(size.dtype).eps > _MOST_LOST * self.dim
 
@@ -232,11 +227,9 @@ def in_chunks(points: Tensor, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]
 
 
 class Sums:
-    """Moments of points with responsibilities, added up chunk by chunk.
-
-    With `about` (K, D), second moments are about these points: no digits cancel if they are near the
-    means. Otherwise they are sums of the linear form's features, about 0.
-    """
+    """Moments of points with responsibilities, added up chunk by chunk. With `about` (K, D), second moments
+    are about these points: no digits cancel if they are near the means. Otherwise they are sums of the linear
+    form's features, about 0."""
 
     def __init__(self, n_components: int, like: Tensor, kind: str, about: Tensor | None = None) -> None:
         k, dim = n_components, like.shape[1]
@@ -302,8 +295,7 @@ class Sums:
 
     def moments(self) -> tuple[Parameters, Tensor]:
         """Number of points, mean and covariance of each component, and the second moments that the
-        covariances come from: (K, D), tied (1, D), spherical (K, 1). Overwrites the sums.
-        """
+        covariances come from: (K, D), tied (1, D), spherical (K, 1). Overwrites the sums."""
         count = self._count + 10 * torch.finfo(self._count.dtype).eps
         means, dim = self._first / count[:, None], self._first.shape[1]
         shift = means if self._about is None else means - self._about * (self._count / count)[:, None]
@@ -330,10 +322,8 @@ class Sums:
 
 
 def have_cancelled(second: Tensor, covariances: Tensor, kind: str, linear: bool) -> Tensor:
-    """Whether covariances, as differences of second moments, lost digits that they need, ().
-
-    Those of the linear form also if they are thin in a direction that is not an axis.
-    """
+    """Whether covariances, as differences of second moments, lost digits that they need, (). Those of the
+    linear form also if they are thin in a direction that is not an axis."""
     if kind in ("full", "tied"):
         diagonal = covariances.diagonal(dim1=-2, dim2=-1).view_as(second)
         scale = torch.maximum(second, diagonal).rsqrt().view(covariances.shape[:-1])
@@ -357,11 +347,8 @@ def expected_moments(
     about: Tensor | None = None,
     rows: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Sums, Tensor]:
-    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), ().
-
-    Direct unless `linear`, with second moments about the last means, or `about` (K, D). `rows`: see
-    `rows_of_few_dimensions`.
-    """
+    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), (). Direct unless `linear`, with
+    second moments about the last means, or `about` (K, D). `rows`: see `rows_of_few_dimensions`."""
     if points.shape[1] <= FEW_DIMENSIONS and linear:
         rows = (em.quadratic_features(points), sample_weight) if rows is None else rows
         statistics, value = em.expectation(*rows, factors.natural(), softmax_dtype)
@@ -409,8 +396,7 @@ def moments_of_labels(
 
 def maximized(moments: Parameters, reg_covar: float, previous: Parameters | None, kind: str) -> Parameters:
     """M-step (2.4)-(2.6), in place. A component that lost all its points keeps its `previous` mean and
-    covariance.
-    """
+    covariance."""
     count, means, covariances = moments
     eps = 10 * torch.finfo(count.dtype).eps
     alive, weights = count > eps, count + eps
@@ -460,10 +446,8 @@ def em_step(
 def exact_step(
     gather: Gather, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool = False
 ) -> Moved:
-    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean.
-
-    With `linear`, the linear form is tried first, if that is the fastest.
-    """
+    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean. With
+    `linear`, the linear form is tried first, if that is the fastest."""
     given = (gather, factors, reg_covar, previous)
     if linear and has_linear_form(len(factors.means), factors.dim, factors.kind):
         found = em_step(*given, linear=True)

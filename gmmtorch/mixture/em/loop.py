@@ -107,10 +107,7 @@ def has_converged(bounds: Sequence[float], tol: float, previous_bound: float = -
 
 
 def em_step(
-    rows: Rows,
-    reg_covar: float,
-    softmax_dtype: torch.dtype = torch.float32,
-    covariance_type: str = "full",
+    rows: Rows, reg_covar: float, softmax_dtype: torch.dtype = torch.float32, covariance_type: str = "full"
 ) -> Steps[Parameters]:
     """EM steps on points, centred, or cells. Covariances have the shape of their type.
 
@@ -177,10 +174,8 @@ def em_step(
 def _ahead(
     step: Callable[[Parameters], tuple[Parameters, Tensor]], checked: Step[Parameters], n_ahead: int
 ) -> Steps[Parameters]:
-    """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them.
-
-    A step whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost.
-    """
+    """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them. A step
+    whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost."""
 
     def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
         states, unread = [parameters], []
@@ -235,10 +230,8 @@ def blend(previous: Parameters, update: Parameters, step: float, kind: str = "fu
 
 
 def weight_of_past(seen: float | None, memory: float | None) -> float:
-    """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`.
-
-    Raises `InvalidArgumentError` for an invalid memory, or memory=None if `seen` is unknown.
-    """
+    """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`. Raises
+    `InvalidArgumentError` for an invalid memory, or memory=None if `seen` is unknown."""
     if memory is None:
         if seen is None:
             raise InvalidArgumentError(

@@ -85,13 +85,6 @@ def surface_rule(noise: float, dim: int, min_points: float | None = None) -> Fla
     )
 
 
-class Partition(NamedTuple):
-    """labels (N,): the piece of each point; n_pieces: number of pieces, none of them empty."""
-
-    labels: Tensor
-    n_pieces: int
-
-
 def pool(features: Tensor, weight: Tensor, labels: Tensor, n_pieces: int) -> Tensor:
     """Weighted sums (n_pieces, F) of features (N, F) by label: the statistics of each piece."""
     sums = features.new_zeros(n_pieces, features.shape[1])
@@ -100,8 +93,9 @@ def pool(features: Tensor, weight: Tensor, labels: Tensor, n_pieces: int) -> Ten
 
 def partition(
     points: Tensor, weight: Tensor, rule: FlatnessRule, features: Tensor | None = None
-) -> Partition:
-    """Partition points (N, D), centred, float64, N ≥ 1, with weights (N,), into flat pieces.
+) -> tuple[Tensor, int]:
+    """Partition points (N, D), centred, float64, N ≥ 1, with weights (N,), into flat pieces: the piece of
+    each point, (N,), and the number of pieces, none of them empty.
 
     If the points are the means of cells, pass the cells' mean features `features` (N, F), so that the
     extent within the cells counts towards the thickness.
@@ -112,11 +106,11 @@ def partition(
         limit = -1 if rule.max_components is None else rule.max_components
         given = vars(rule) | {"n_levels": _MAX_LEVELS, "max_components": limit}
         cuts = CutRule(**given, thickness_priority=_THICKNESS_PRIORITY)
-        return Partition(*piece_cuts(points, weight, features, cuts))
+        return piece_cuts(points, weight, features, cuts)
     if points.device.type != "cpu" and n <= _MOST_ON_CPU:
         points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
-        found = partition(points_cpu, weight_cpu, rule, features_cpu)
-        return found._replace(labels=found.labels.to(points.device))
+        labels, n_pieces = partition(points_cpu, weight_cpu, rule, features_cpu)
+        return labels.to(points.device), n_pieces
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):
@@ -144,13 +138,11 @@ def partition(
         new_label = torch.cumsum(cut.long(), 0) - 1 + n_pieces
         labels = torch.where(cut[labels] & beyond, new_label[labels], labels)
         n_pieces += n_new
-    return Partition(labels, n_pieces)
+    return labels, n_pieces
 
 
 def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | None) -> Tensor:
-    """The pieces of highest priority among those to halve, within the limit, and half of all once there
-    are many.
-    """
+    """The pieces of highest priority among those to halve; once there are many, half of all at most."""
     if limit is None:
         return cut
     order = torch.where(cut, priority, -torch.inf).argsort(descending=True, stable=True)
@@ -165,11 +157,9 @@ def _is_supported(
     along: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor, outlier_gap: float
 ) -> Tensor:
     """Whether a cut at 0 of the positions (N,) along each piece's axis leaves enough points, (n_pieces,).
-
     Both halves must weigh `least` (n_pieces,). A smaller half is also allowed if it is an outlier: farther
     than `outlier_gap` (m), and farther than six standard deviations of the larger half. Otherwise a few stray
-    returns would prevent the partition of their whole piece.
-    """
+    returns would prevent the partition of their whole piece."""
     side = labels * 2 + (along > 0)
     if not bool(least.any()):
         return torch.bincount(side, minlength=2 * n_pieces).view(n_pieces, 2).amin(1) > 0

@@ -26,7 +26,6 @@ import functools
 import math
 from collections import deque
 from dataclasses import KW_ONLY, dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -106,15 +105,9 @@ class RiemannianGaussianMixture(MixtureEstimator):
 # -- the objective and its manifold ---------------------------------------------------------------
 
 
-class Frames(NamedTuple):
-    """H_k in parts: H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0, Σ⁻¹ = AᵀA and 1/s = ‖b‖².
-
-    linear: A (K, D+1, D); means: μ (K, D); offset: b (K, D+1).
-    """
-
-    linear: Tensor
-    means: Tensor
-    offset: Tensor
+Frames = tuple[Tensor, Tensor, Tensor]
+"""H_k in parts, A (K, D+1, D), μ (K, D) and b (K, D+1): H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0,
+Σ⁻¹ = AᵀA and 1/s = ‖b‖²."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +125,7 @@ class Likelihood:
         whiten = inverse_factor(safe_cholesky(covariances)).mT
         linear = nn.functional.pad(whiten, (0, 0, 0, 1))
         offset = nn.functional.pad(torch.zeros_like(means), (0, 1), value=1.0)
-        return self.evaluate(Frames(linear, means, offset), torch.log(weights.clamp_min(1e-300)))
+        return self.evaluate((linear, means, offset), torch.log(weights.clamp_min(1e-300)))
 
     def evaluate(self, frames: Frames, log_weights: Tensor) -> Iterate:
         """f and its gradient for frames of K components and log-weights η (K,), not necessarily
@@ -184,10 +177,8 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Iterate:
-    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2).
-
-    Each row of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η.
-    """
+    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2). Each row
+    of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η."""
 
     likelihood: Likelihood
     frames: Frames
@@ -198,28 +189,25 @@ class Iterate:
     inverse_hessian: Tensor
 
     def bounded(self, direction: Tensor) -> Tensor:
-        """The direction with a limited norm in each component.
-
-        Outdated curvature can give an arbitrarily long step to a component that loses its points.
-        """
+        """The direction with a limited norm in each component. Outdated curvature can give an arbitrarily
+        long step to a component that loses its points."""
         return direction / (direction.norm(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1)
 
     def move(self, tangent: Tensor) -> Iterate:
         """H ← exp(−Ξ/2) H and η ← η + Δη; then x is taken relative to the new means."""
-        matrices, change = unpack_tangent(tangent, self.frames.offset.shape[1])
+        linear, means, offset = self.frames
+        matrices, change = unpack_tangent(tangent, offset.shape[1])
         spread = torch.linalg.matrix_exp(-0.5 * matrices)
-        linear = spread @ self.frames.linear
-        offset = (spread @ self.frames.offset[:, :, None]).squeeze(-1)
+        linear, offset = spread @ linear, (spread @ offset[:, :, None]).squeeze(-1)
         basis, factor = torch.linalg.qr(linear)
         along = basis.mT @ offset[:, :, None]
         shift = torch.linalg.solve_triangular(factor, along, upper=True).squeeze(-1)
-        offset = offset - (basis @ along).squeeze(-1)
-        frames = Frames(linear, self.frames.means - shift, offset)
+        frames = linear, means - shift, offset - (basis @ along).squeeze(-1)
         return self.likelihood.evaluate(frames, self.log_weights + change)
 
     def parameters(self) -> Parameters:
         """The mixture, with s = 1."""
-        return Parameters(self.log_weights.exp(), self.frames.means, self.covariances)
+        return Parameters(self.log_weights.exp(), self.frames[1], self.covariances)
 
 
 def pack_tangent(matrices: Tensor, change: Tensor) -> Tensor:
@@ -270,10 +258,8 @@ def ascend(
     point: Iterate, *, tol: float, max_iter: int, on_iteration: OnIteration | None = None
 ) -> tuple[Iterate, list[float], bool]:
     """Climb from a point. Returns the final point, the value after each iteration, and whether it converged.
-
     Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
-    gain less, to second order; or no higher point was found, to rounding. Values never decrease.
-    """
+    gain less, to second order; or no higher point was found, to rounding. Values never decrease."""
     memory, values = Memory(maxlen=_MEMORY), list[float]()
     for iteration in range(max_iter):
         found = _climb(point, memory)
@@ -289,10 +275,7 @@ def ascend(
 
 
 def _climb(point: Iterate, memory: Memory) -> Iterate:
-    """A higher point, or the same point if there is none.
-
-    Clears the memory if its direction does not ascend.
-    """
+    """A higher point, or the same one; clears the memory if its direction does not ascend."""
     while True:
         direction = point.bounded(quasi_newton(point, memory))
         length, found = search(point, direction)
@@ -309,10 +292,8 @@ def _climb(point: Iterate, memory: Memory) -> Iterate:
 
 def search(point: Iterate, direction: Tensor) -> tuple[float, Iterate]:
     """Step length along a direction, and the point there; 0 and `point` if the direction does not ascend.
-
-    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the
-    weak Wolfe conditions hold (Nocedal & Wright, 3.6).
-    """
+    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the weak
+    Wolfe conditions hold (Nocedal & Wright, 3.6)."""
     slope = _dot(point.gradient, direction)
     best = (0.0, point)
     if not slope > 1e-16 * abs(point.value):
