@@ -202,8 +202,6 @@ class Mission:
             raise RuntimeError("This mission has no score.")
         return self._score
 
-    # -- time -------------------------------------------------------------------------------------
-
     @property
     def tick_seconds(self) -> float:
         return self.options.tick_seconds
@@ -274,8 +272,6 @@ class Mission:
         """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, … of trajectories.npz."""
         poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(self.trajectories)}
         write_npz(folder / "trajectories.npz", **poses)
-
-    # -- the stages of a tick ---------------------------------------------------------------------
 
     def _sense(self, agent: Agent, now: float) -> None:
         others = [other.position for other in self.robots if other is not agent.robot]

@@ -196,9 +196,6 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
     }
 
 
-# -- missions side by side ------------------------------------------------------------------------
-
-
 def variant_of(
     row: Mapping[str, Any], fields: Sequence[str] = VARIANT, without: Collection[str] = ()
 ) -> tuple[Any, ...]:
