@@ -363,19 +363,14 @@ def plan_alone(agent: Agent, options: TeamOptions, now: float, number: int) -> N
     paths of the plans that it has heard, and discounts the views of those heard in the last planning
     period."""
     agent.begin_planning(now)
-    heard = agent.robot.plans
-    step = options.dynamics.step
+    heard, dynamics = agent.robot.plans, options.dynamics
     paths = [
-        predicted_path(plan, now - agent.heard_at[peer], step)
+        predicted_path(plan, now - agent.heard_at[peer], dynamics.step)
         for peer, plan in sorted(heard.items())
         if len(plan.path)
     ]
-    agent.propose(
-        now,
-        list(heard),
-        PeerTrajectories.of(paths, options.separation),
-        since=now - options.dynamics.duration,
-    )
+    peers = PeerTrajectories.of(paths, options.separation)
+    agent.propose(now, list(heard), peers, since=now - dynamics.duration)
     agent.follow()
     agent.send_plan(now, number)
     agent.send_views(now)

@@ -127,10 +127,7 @@ def _finite(name: str, values: ArrayLike, n_axes: int) -> np.ndarray:
 
 
 PLANNING = ("planner", "information", "coordination", "planning_prior")
-NETWORK = (
-    *("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions"),
-    *("announce", "budget"),
-)
+NETWORK = ("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions", "announce", "budget")
 VARIANT = ("framework", *PLANNING, *THESIS, *NETWORK)
 """Fields of a row that say which variant of a study it belongs to."""
 _LOSSES = ("loss", "partitions")
