@@ -71,10 +71,7 @@ class Runtime(Memory):
         "GPU exact EM in float32, where that errs by less than 0.001 nats). float64: all computations, "
         "except those of map=incremental",
     )
-    compile: bool = option(
-        False,
-        "without effect: fused kernels are compiled anyway",
-    )
+    compile: bool = option(False, "without effect: fused kernels are compiled anyway")
 
 
 def conf_dir() -> str:

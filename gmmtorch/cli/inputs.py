@@ -125,17 +125,10 @@ def read_scans(dataset: Dataset, indices: Sequence[int], device: str, on_event: 
     return scans
 
 
-# -- maps ------------------------------------------------------------------------------------------
-
-
 def limits(config: DictConfig) -> dict[str, Any]:
     """Arguments of every map from `runtime.*` and the seed."""
     runtime = config.runtime
-    return {
-        "memory_limit": runtime.memory_limit,
-        "compiled": runtime.compile,
-        "random_state": config.seed,
-    }
+    return {"memory_limit": runtime.memory_limit, "compiled": runtime.compile, "random_state": config.seed}
 
 
 def open_map(

@@ -188,9 +188,6 @@ def _brief(text: str) -> str:
     return kept.rstrip(".")
 
 
-# -- groups ---------------------------------------------------------------------------------------
-
-
 @functools.cache
 def groups_of(command: str) -> dict[str, list[str]]:
     """The choices of every group that a command can run, as its help lists them."""
@@ -204,9 +201,6 @@ def groups_of(command: str) -> dict[str, list[str]]:
     for name, group in re.findall(r"^  - .*?/((\w+)@\S+):", text, re.MULTILINE):  # of a part, as log.dataset
         found[name] = sorted(path.stem for path in (conf / group).glob("*.yaml"))
     return found
-
-
-# -- help -----------------------------------------------------------------------------------------
 
 
 def help_text(command: str, overrides: Sequence[str] = ()) -> str:
@@ -225,9 +219,6 @@ def text_of_value(value: Any) -> str:
     if value is None:
         return "null"
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-# -- completion -----------------------------------------------------------------------------------
 
 
 def completions(command: str, line: str) -> list[str]:
@@ -264,9 +255,6 @@ def _tolerant(command: str, overrides: Sequence[str]) -> DictConfig:
                 continue
             kept.append(override)
     return config
-
-
-# -- mistakes -------------------------------------------------------------------------------------
 
 
 def _is_installed(module: str) -> bool:

@@ -223,9 +223,6 @@ def _show(
     return exported, errors
 
 
-# -- the recordings ----------------------------------------------------------------------------------
-
-
 _LONGEST_NAME = 60
 
 
@@ -308,9 +305,6 @@ def _errors_of(url: str) -> Iterator[None]:
             f"inputs: {url} cannot be read ({type(error).__name__}: {error}); check the address and your "
             "access to it."
         ) from error
-
-
-# -- tasks -------------------------------------------------------------------------------------------
 
 
 _TRIES = 3

@@ -26,9 +26,6 @@ Tree = dict[str, Any]
 _ABOUT, _PYTHON = "about", "python"
 
 
-# -- schemas --------------------------------------------------------------------------------------
-
-
 def schema_of(*sources: type | tuple[str, type], without: Collection[str] = (), **choices: str) -> Any:
     """A dataclass that OmegaConf accepts as a schema, with the options of these dataclasses.
 
@@ -164,9 +161,6 @@ def _names(node: DictConfig, prefix: str) -> Iterator[tuple[str, str]]:
         yield str(_metadata(node, key).get(_PYTHON, key)), f"{prefix}{key}"
 
 
-# -- objects --------------------------------------------------------------------------------------
-
-
 def build(cls: type[T], config: Any, prefix: str = "", **others: Any) -> T:
     """An object of a dataclass from the options of a configuration, or of a group of it.
 
@@ -278,9 +272,6 @@ def checked_options(schema: Any, options: Any, name: str) -> dict[str, Any]:
         ) from error
     plain: Any = OmegaConf.to_container(found)
     return dict(plain)
-
-
-# -- Hydra's store --------------------------------------------------------------------------------
 
 
 @dataclass

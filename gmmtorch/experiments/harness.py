@@ -69,9 +69,6 @@ def hardware(device: str = "cpu") -> str:
     )
 
 
-# -- tables ----------------------------------------------------------------------------------------------
-
-
 @dataclass
 class Table:
     """The results of a case.
@@ -135,9 +132,6 @@ def markdown(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     names = list(header)
     lines = [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
     return "\n".join([*lines, *(f"| {' | '.join(map(str, row))} |" for row in rows)])
-
-
-# -- cases -----------------------------------------------------------------------------------------------
 
 
 class Case(NamedTuple):
@@ -269,9 +263,6 @@ def command_line() -> str:
     return " ".join(["python", *("$GMMTORCH_DATA" if word == data else shlex.quote(word) for word in words)])
 
 
-# -- data ------------------------------------------------------------------------------------------------
-
-
 def recording(data: Path, name: str, **options: Any) -> Dataset:
     """A 2D log, frames of a depth camera, or a folder of 3D scans, by its name below the folder."""
     log = data / "laser2d" / f"{name}.log.gz"
@@ -289,9 +280,6 @@ def score(answer: Any, asked: Queries, resolution: float) -> float:
     """AUC of the answers of a map."""
     theta = torch.as_tensor(answer.occupancy(asked.points, resolution))
     return roc(theta[asked.of(OCCUPIED)], theta[asked.of(FREE)]).auc
-
-
-# -- seconds and memory ----------------------------------------------------------------------------------
 
 
 @contextmanager

@@ -72,9 +72,6 @@ def checked(mixture: PlainMixture) -> PlainMixture:
     return PlainMixture(weights / total, means, covariances, support)
 
 
-# -- GIRA's CSV -----------------------------------------------------------------------------------
-
-
 def write_gira_csv(path: str | Path, mixture: PlainMixture) -> Path:
     """Writes the mixture, atomically, in the format of GIRA's `gmm_utils`: one row per component, no header.
 
@@ -118,9 +115,6 @@ def read_gira_csv(path: str | Path, n_points: float | None = None) -> PlainMixtu
     return found if n_points is None else found._replace(support=found.weights * n_points)
 
 
-# -- NPZ ------------------------------------------------------------------------------------------
-
-
 def write_npz(path: str | Path, mixture: PlainMixture) -> Path:
     """Writes the mixture, atomically, as NPZ: weights, means, covariances and, if known, support; float64."""
     sound = checked(mixture)
@@ -157,9 +151,6 @@ def read_npz(path: str | Path) -> PlainMixture:
     except Exception as error:  # also SyntaxError and TokenError of a header, and errors of zlib and zipfile
         raise DataError(f"{path} is damaged, or not an NPZ file of numbers: {error}") from error
     return _sound(path, PlainMixture(**arrays))
-
-
-# -- checks of a file -----------------------------------------------------------------------------
 
 
 def _readable(path: str | Path, what: str) -> Path:

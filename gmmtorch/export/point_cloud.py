@@ -227,10 +227,7 @@ _MIN_PROBABILITY = 1e-6  # least distance of a probability from 0 and 1: log-odd
 
 
 def write_octomap(
-    path: str | Path,
-    cells: CellCloud,
-    thresholds: Thresholds | None = None,
-    colours: Tensor | None = None,
+    path: str | Path, cells: CellCloud, thresholds: Thresholds | None = None, colours: Tensor | None = None
 ) -> Path:
     """Writes the cells, atomically, as an OctoMap: `.ot` with log-odds, or `.bt` with two classes.
 

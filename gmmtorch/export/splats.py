@@ -177,9 +177,6 @@ def _glb(splats: Splats) -> bytes:
     )
 
 
-# -- reading ---------------------------------------------------------------------------------------------
-
-
 def read_splats(path: str | Path) -> Splats:
     """The splats of a .ply or .spz file, in the frame of `write_splats`, without harmonics above degree 0.
 

@@ -122,8 +122,6 @@ class LiveScans(Dataset):
         self.trouble = ""
         """Why the last scan without a pose has none."""
 
-    # -- messages -------------------------------------------------------------------------------------
-
     def receive(self, message: dict[str, Any], received: int, since: float | None = None) -> None:
         """Queues a decoded message of the sensor.
 
@@ -182,8 +180,6 @@ class LiveScans(Dataset):
 
     def _note(self, reason: str) -> None:
         self._counts[reason] += 1
-
-    # -- poses ----------------------------------------------------------------------------------------
 
     def _is_ready(self, item: _Waiting) -> bool:
         """Whether everything that the conversion of a message needs has arrived, or never will."""
@@ -251,8 +247,6 @@ class LiveScans(Dataset):
         if self._conversion is None or not isinstance(self._conversion.source, TfPoses):
             return "map"
         return self._options.frame or self._candidate[0][-1]
-
-    # -- scans ----------------------------------------------------------------------------------------
 
     def _convert(self, item: _Waiting) -> bool:
         """Makes a message the newest scan, unless it is left out."""
@@ -346,8 +340,6 @@ class LiveScans(Dataset):
         """Odometry begins where the next scan is found in a map; scans that are not found are left out."""
         if self._odometry is not None:
             self._tracker = Tracker(known)
-
-    # -- as a data set --------------------------------------------------------------------------------
 
     @property
     def skipped(self) -> dict[str, int]:

@@ -137,8 +137,6 @@ class LiveView:
             self._waiting, self._is_busy = moment, True
             self._changed.notify_all()
 
-    # -- the thread -----------------------------------------------------------------------------------
-
     def _work(self) -> None:
         while True:
             with self._changed:

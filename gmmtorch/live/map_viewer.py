@@ -155,8 +155,6 @@ class MapViewer:
                 path, self._map, self._paths, shape=self._shape.value, colour=self._colour.value
             )
 
-    # -- the scene ------------------------------------------------------------------------------------
-
     def _fit(self, view: viewer_scene.Frame, flat: bool) -> None:
         """Fits the camera to a frame; the first one moves the origin. flat: the camera looks from above."""
         if not self._is_lit:
@@ -269,8 +267,6 @@ class MapViewer:
         if name in self._nodes:
             self._nodes.pop(name).remove()
 
-    # -- controls -------------------------------------------------------------------------------------
-
     def _add_controls(self, shape: str, colour: str) -> None:
         gui = self.server.gui
         gui.configure_theme(dark_mode=False, show_logo=False, show_share_button=False)
@@ -344,9 +340,6 @@ def _check_address(host: str, port: int) -> None:
         raise InvalidArgumentError(
             f"host={host} is not an address of this machine ({error}); use 127.0.0.1, or 0.0.0.0 for all."
         ) from error
-
-
-# -- who may see the page ----------------------------------------------------------------------------
 
 
 def admits(host: str, origin: str | None, served: str, origins: Sequence[str] = ()) -> bool:

@@ -84,8 +84,6 @@ class MapPublisher:
         if self._send_ellipsoids is not None:
             self._send_ellipsoids({"markers": _markers(shown, header["header"])}, stamp)
 
-    # -- the grid -------------------------------------------------------------------------------------
-
     def _probabilities(self, shown: GaussianMap) -> tuple[VoxelGrid | None, Tensor]:
         """The cells of the map, in 3D of the height band, and their probabilities, with the grid's shape."""
         try:

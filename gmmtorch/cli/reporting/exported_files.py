@@ -31,9 +31,6 @@ def write_poses(path: Path, output: Path) -> str:
     return f"{_size(output)}: {len(matrices):,} poses"
 
 
-# -- components -----------------------------------------------------------------------------------
-
-
 def write_components(config: DictConfig) -> str:
     """Write weights, means and covariances, or splats; returns a message."""
     output = Path(config.output)
@@ -74,9 +71,6 @@ def _components(config: DictConfig) -> export.PlainMixture:
     except DataError as error:
         raise DataError(f"{path} contains no components to export. {no_map} {error}") from error
     return export.PlainMixture(mixture.weights, mixture.means, mixture.covariances)
-
-
-# -- space ----------------------------------------------------------------------------------------
 
 
 Source = GaussianMap | OccupancyGrid

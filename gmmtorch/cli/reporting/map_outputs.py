@@ -16,12 +16,7 @@ from gmmtorch import localization, report  # whose parts load when they are used
 from gmmtorch.cli import common, schema
 from gmmtorch.cli.export import ExportOptions
 from gmmtorch.datasets import Dataset, Reposed, read_trajectory
-from gmmtorch.errors import (
-    GmmTorchError,
-    InvalidArgumentError,
-    MemoryLimitError,
-    check_number,
-)
+from gmmtorch.errors import GmmTorchError, InvalidArgumentError, MemoryLimitError, check_number
 from gmmtorch.export import write_pose_table, write_tum
 from gmmtorch.mapping import Components, GaussianMap, MapBuilder, TiledMap
 from gmmtorch.occupancy import reliability_of, scores_of
@@ -129,11 +124,7 @@ def write_estimated_poses(dataset: Dataset, estimated: localization.Trajectory, 
     dim = estimated.poses.shape[1] - 1
     turn = estimated.poses[:, :dim, :dim]
     axes = Pose(turn, turn.new_zeros(len(turn), dim)).adjoint()
-    columns = {
-        "scan": range(len(turn)),
-        "found": estimated.found.int().tolist(),
-        "doubts": estimated.doubts,
-    }
+    columns = {"scan": range(len(turn)), "found": estimated.found.int().tolist(), "doubts": estimated.doubts}
     spread = axes @ estimated.covariances @ axes.mT  # of the sensor's axes, in those of the world
     write_pose_table(folder / POSE_TABLE, localization.scan_times(dataset), estimated.poses, spread, columns)
 

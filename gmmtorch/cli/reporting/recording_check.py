@@ -113,9 +113,6 @@ def _print_wrapped(label: str, text: str) -> None:
     )
 
 
-# -- the bag -----------------------------------------------------------------------------------------
-
-
 def _bag(options: DictConfig) -> BagFacts | None:
     """The facts of a bag, printed; None if it cannot be read at all, which the data set's error explains."""
     path = Path(str(options.path)).expanduser()
@@ -177,9 +174,6 @@ def _clock_advice(facts: BagFacts) -> Iterator[str]:
                     f"stamps of {sensor.topic.name} and {other.topic.name} that were recorded together are "
                     f"{by} apart: their clocks differ, which dataset.clock=received may mend"
                 )
-
-
-# -- scans and poses ---------------------------------------------------------------------------------
 
 
 def _print_scans(found: Dataset, advice: list[str]) -> float:
@@ -271,9 +265,6 @@ def _print_poses(found: Dataset, advice: list[str]) -> None:
         advice.append(
             "by its poses the sensor stands still; if it moved, estimate them: dataset.odometry=mixture"
         )
-
-
-# -- other options -----------------------------------------------------------------------------------
 
 
 def _trials(options: DictConfig, facts: BagFacts, n_found: int, problem: str) -> list[str]:

@@ -199,8 +199,6 @@ class BGKPointsMap(BGKMap):
         side = self.ds_resolution * self._growth
         return CellTable(side, dim, 1 + dim, device, self.memory_limit)
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, scan: Scan) -> None:
         samples, is_hit = self._samples(scan)
         self._bins = None
@@ -217,8 +215,6 @@ class BGKPointsMap(BGKMap):
         for table, earlier in zip(self._tables, finer, strict=True):
             _add(table, *_points(earlier))
 
-    # -- queries ----------------------------------------------------------------------------------
-
     def finish(self) -> None:
         """Sorts the samples into bins, which is otherwise deferred to the first query."""
         if self._bins is None:
@@ -228,8 +224,6 @@ class BGKPointsMap(BGKMap):
         self.finish()
         hits, misses = (bins.kernel_sum(query) * self.scale for bins in self._bins or [])
         return torch.where(hits + misses > 0, beta_mean(hits, misses, self.prior), 0.5)
-
-    # -- files ------------------------------------------------------------------------------------
 
     def _facts(self) -> dict[str, Any]:
         return {**super()._facts(), "growth": self._growth}

@@ -36,8 +36,6 @@ class CellTable(SparseLattice):
         self.values = torch.zeros(0, width, device=device)
         """The numbers (N, width), float32, in the order of `keys`."""
 
-    # -- geometry ---------------------------------------------------------------------------------
-
     def cells(self, points: Tensor) -> Tensor:
         """Cell (M, D), int64, of each finite point (M, D), world metres.
 
@@ -55,8 +53,6 @@ class CellTable(SparseLattice):
 
     def _cell_keys(self, columns: list[Tensor]) -> Tensor:
         return (self.block_keys(columns) << (self.local_bits * self.dim)) | self.places(columns)
-
-    # -- rows -------------------------------------------------------------------------------------
 
     def open(self, cells: Tensor) -> Tensor:
         """Row (M,) of each cell (M, D), int64. New cells get a row of zeros, which can move earlier rows.
@@ -102,8 +98,6 @@ class CellTable(SparseLattice):
         rows, known = self.find_keys(self._cell_keys(columns))
         known = known & reachable
         return torch.where(known, rows, 0), known
-
-    # -- files ------------------------------------------------------------------------------------
 
     def packed(self, kept: Tensor | None = None, prefix: str = "") -> dict[str, Tensor]:
         """Anchor, blocks and one bit for each cell: they name the cells of the rows `kept` (N,) or of all."""

@@ -123,8 +123,6 @@ class GPMap(CellMap):
         self.memory_limit = memory_limit
         self._start(2, torch.device("cpu"))
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, scan: Scan) -> None:
         samples, is_hit = thinned_samples(scan, self.free_resolution, self.ds_resolution, self.max_range)
         if samples.shape[0] == 0:
@@ -192,8 +190,6 @@ class GPMap(CellMap):
         fused = torch.zeros_like(self._table.values, dtype=torch.float64)
         fused.index_add_(0, rows, torch.stack([mean / variance, precision], 1))
         self._table.values += fused.float()
-
-    # -- queries ----------------------------------------------------------------------------------
 
     def _answer(self, query: Tensor) -> Tensor:
         weighted, precision = self._table.at(query).unbind(1)

@@ -34,9 +34,6 @@ Design = DenseDesign | LatticeDesign
 Covariance = Literal["diagonal", "mean_field", "full"]
 
 
-# -- stochastic gradients ---------------------------------------------------------------------------
-
-
 def logistic_regression(
     design: Design,
     is_hit: Tensor,
@@ -75,9 +72,6 @@ def logistic_regression(
             change = change - step * gradient
             change = change.sign() * (change.abs() - step * l1).clamp_min(0)
     return weights + change
-
-
-# -- variational inference --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -194,8 +188,6 @@ def fit_posterior(
     return posterior
 
 
-# -- the maps --------------------------------------------------------------------------------------------
-
 Features = DenseFeatures | LatticeFeatures
 FeatureKind = Literal["sparse", "nystroem", "fourier"]
 _LENGTHS: dict[str, float] = {"sparse": 0.3, "nystroem": 0.5, "fourier": 0.5}
@@ -282,8 +274,6 @@ class HilbertMap(TensorFileMap):
             check_lattice("sparse", self.length, self.spacing, dim)
         self._anchor = torch.zeros(dim, dtype=torch.float64, device=device)
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, scan: Scan) -> None:
         points, is_hit = beam_samples(
             scan, self.free_spacing, gap=self.gap, thin=self.thin, generator=self._generator
@@ -347,8 +337,6 @@ class HilbertMap(TensorFileMap):
     def _lattice(self, dim: int, device: torch.device) -> LatticeFeatures:
         return LatticeFeatures("sparse", self.length, self.spacing, dim, 1, device)
 
-    # -- queries ----------------------------------------------------------------------------------
-
     def _answer(self, query: Tensor) -> Tensor:
         model = self.model()
         theta = query.new_full((query.shape[0],), 0.5)
@@ -360,8 +348,6 @@ class HilbertMap(TensorFileMap):
                 probability = torch.sigmoid(design.dot(weights.double()))
                 theta[index] = torch.where(design.in_reach(), probability, 0.5)
         return theta
-
-    # -- files ------------------------------------------------------------------------------------
 
     def _tensors(self) -> dict[str, Tensor]:
         """The features and their weights as float32, without the points."""
@@ -470,8 +456,6 @@ class BayesianHilbertMap(TensorFileMap):
         self._hinges = self._lattice(dim, device)
         self._factor = torch.empty(0, 0, device=device)
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, scan: Scan) -> None:
         points, is_hit = beam_samples(
             scan, self.free_spacing, gap=self.gap, thin=self.thin, generator=self._generator
@@ -519,8 +503,6 @@ class BayesianHilbertMap(TensorFileMap):
         precision[old[:, None], old] = factor @ factor.mT
         self._factor = torch.linalg.cholesky(precision).float()
 
-    # -- queries ----------------------------------------------------------------------------------
-
     def _answer(self, query: Tensor) -> Tensor:
         theta = query.new_full((query.shape[0],), 0.5)
         if not self._hinges.count:
@@ -530,8 +512,6 @@ class BayesianHilbertMap(TensorFileMap):
         for index in finite.split(self._max_points):
             theta[index] = moderated(*moments(self._hinges.design(query[index]), posterior))
         return theta
-
-    # -- files ------------------------------------------------------------------------------------
 
     def _tensors(self) -> dict[str, Tensor]:
         """Hinges, means, and precisions or the lower triangle of their Cholesky factor, as float32."""

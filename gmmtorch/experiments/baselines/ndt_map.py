@@ -132,8 +132,6 @@ class NDTMap(CellMap):
         width = 2 + dim + dim * (dim + 1) // 2
         self._table = CellTable(self.resolution, dim, width, device, self.memory_limit)
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, scan: Scan) -> None:
         origin, (ends, is_hit) = scan.origin.double(), scan.ends()
         ends = ends.double()
@@ -239,8 +237,6 @@ class NDTMap(CellMap):
         eigenvalues = torch.maximum(eigenvalues, least)
         return mean, (vectors / eigenvalues[:, None, :]) @ vectors.transpose(1, 2)
 
-    # -- queries ----------------------------------------------------------------------------------
-
     def _answer(self, query: Tensor) -> Tensor:
         if self._table.keys.shape[0] == 0:
             return query.new_full((query.shape[0],), 0.5)
@@ -253,8 +249,6 @@ class NDTMap(CellMap):
         squared = torch.einsum("md,mde,me->m", difference, precision[inverse], difference)
         theta[has_gaussian] *= torch.exp(-0.5 * squared / self.spread**2)
         return theta
-
-    # -- files ------------------------------------------------------------------------------------
 
     def _tensors(self) -> dict[str, Tensor]:
         """The cells and their log-odds; for cells with returns also count, mean and scatter; float32."""

@@ -194,8 +194,6 @@ class OctoMapMap(BaselineMap):
         self._tree.setClampingThresMin(self.clamp_low)
         self._tree.setClampingThresMax(self.clamp_high)
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, scan: Scan) -> None:
         if self._anchor is None:
             self._anchor = (scan.origin.double() / self.resolution).floor().long()
@@ -251,8 +249,6 @@ class OctoMapMap(BaselineMap):
             local = torch.nn.functional.pad(local, (0, 1), value=self.resolution / 2)
         return local
 
-    # -- queries ----------------------------------------------------------------------------------
-
     def _answer(self, query: Tensor) -> Tensor:
         local = self._local(query)
         inside = (local.abs() < _TREE_REACH * self.resolution).all(1)
@@ -262,8 +258,6 @@ class OctoMapMap(BaselineMap):
         values = [0.5 if node is None else node.getOccupancy() for node in found]
         theta[inside] = torch.tensor(values, dtype=torch.float64)
         return theta
-
-    # -- files ------------------------------------------------------------------------------------
 
     def _facts(self) -> dict[str, Any]:
         return {**super()._facts(), "anchor": None if self._anchor is None else self._anchor.tolist()}

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from gmmtorch.report import Board
 
 
-# -- points and options ----------------------------------------------------------------------------------
-
-
 def fit_options(config: DictConfig) -> FitOptions:
     """The options of a fit from `mixture.*` and `runtime.*`."""
     runtime = config.runtime
@@ -71,9 +68,6 @@ def _subset(points: Tensor, max_points: int | None, seed: int) -> Tensor | slice
         raise InvalidArgumentError(f"max_points={max_points} must be at least 1, or null.")
     generator = torch.Generator().manual_seed(seed)
     return torch.randperm(points.shape[0], generator=generator)[:max_points].sort().values.to(points.device)
-
-
-# -- fits -------------------------------------------------------------------------------------------------
 
 
 def fit_all(
@@ -192,9 +186,6 @@ def _sources(
         config.points, chunk_points=config.stream.chunk_points, max_range=config.dataset.max_range
     )
     return evaluation.split_source(source, config.test_share, config.seed), SAMPLE_POINTS
-
-
-# -- outputs ----------------------------------------------------------------------------------------------
 
 
 def headline(rows: Sequence[Row]) -> str:

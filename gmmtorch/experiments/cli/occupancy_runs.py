@@ -63,9 +63,6 @@ def map_all(
     return outcome.rows
 
 
-# -- outputs ----------------------------------------------------------------------------------------------
-
-
 def draw(config: DictConfig, scans: Sequence[Scan], outcome: Outcome, folder: Path) -> None:
     """Write the figures as PNG, and figures and numbers to TensorBoard."""
     figures = partial(_figures, config, scans, outcome)

@@ -105,9 +105,6 @@ def run(command: str, config: DictConfig, device: str, folder: Path, on_event: E
     return rows
 
 
-# -- of gmmtorch-fit -----------------------------------------------------------------------------
-
-
 def _initialization(setting: Setting) -> list[Row]:
     study = setting.study(studies.InitializationStudy)
     data = fit_data(setting.config, setting.device, setting.on_event)
@@ -183,8 +180,6 @@ FITS = (
         "held_out_log_likelihood auc auc_near_surface thickness sensor_deviation seconds n_iterations nbytes",
     ),
 )
-
-# -- of gmmtorch-occupancy -----------------------------------------------------------------------
 
 
 def _auc_memory(setting: Setting) -> list[Row]:
@@ -307,7 +302,4 @@ MAPS = (
         ],
     ),
 )
-STUDIES = {
-    "fit": {case.name: case for case in FITS},
-    "occupancy": {case.name: case for case in MAPS},
-}
+STUDIES = {"fit": {case.name: case for case in FITS}, "occupancy": {case.name: case for case in MAPS}}

@@ -115,8 +115,6 @@ def choose(names: Sequence[str], known: Mapping[str, MapFactory]) -> dict[str, M
     return {name: known[name] for name in names}
 
 
-# -- the test -------------------------------------------------------------------------------------------
-
 _PREDICTED_SCANS = 50  # of which a map without a calibration predicts some beams
 
 Answer = Callable[[Tensor], Tensor]

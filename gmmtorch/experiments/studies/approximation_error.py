@@ -27,8 +27,6 @@ from gmmtorch.mapping import GaussianMap
 from gmmtorch.occupancy import Cones, Evidence, Sampling, VoxelGrid
 from gmmtorch.report import Event, OnRows, Row, ignore
 
-# -- test scenes ---------------------------------------------------------------------------------------
-
 OFFSETS = (0.0, 0.5, 1.0, 2.0)
 """Offsets of the cells of `cells_before` from the line of sight, in standard deviations."""
 
@@ -139,8 +137,6 @@ def _cone(mean: Tensor, covariance: Tensor) -> Cones:
     one = torch.ones(1, dtype=torch.float64)
     return Cones(mean, covariance, torch.zeros_like(mean), one, torch.zeros(1, dtype=torch.bool))
 
-
-# -- the study -----------------------------------------------------------------------------------------
 
 _DATASETS = {2: "synthetic_building_2d", 3: "synthetic_building"}
 _REFERENCE_TOLERANCE = 1e-6  # of the flux that is the reference of the curve

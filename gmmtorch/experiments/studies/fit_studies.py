@@ -50,18 +50,12 @@ from gmmtorch.mixture import (
 from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 
-# -- the start of EM -----------------------------------------------------------------------------------
-
 MEANS_ONLY = ("random_points", "bounding_box")
 """Initializations that choose means; all covariances are the same multiple of the identity."""
 
 
 def run_initialization(
-    data: FitData,
-    study: InitializationStudy,
-    options: FitOptions,
-    on_event: Event,
-    on_rows: OnRows,
+    data: FitData, study: InitializationStudy, options: FitOptions, on_event: Event, on_rows: OnRows
 ) -> list[Row]:
     """A row for each initialization, number of components and seed: one run of exact EM on the points.
 
@@ -136,8 +130,6 @@ def box_covariances(points: Tensor, n_components: int) -> Tensor:
     side = (points.amax(0) - points.amin(0)).max()
     return (torch.eye(points.shape[1]).to(points) * side**2).expand(n_components, -1, -1)
 
-
-# -- the number of components --------------------------------------------------------------------------
 
 T = TypeVar("T")
 Learned = tuple[MixtureEstimator, float, float]

@@ -24,8 +24,6 @@ from gmmtorch.pose import Pose
 from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 
-# -- AUC against size ----------------------------------------------------------------------------------
-
 
 def run_auc_memory(
     name: str,
@@ -52,8 +50,6 @@ def run_auc_memory(
     )
     return with_size(outcome.rows)
 
-
-# -- options of learning -------------------------------------------------------------------------------
 
 _SCORED_POINTS = 5000
 
@@ -113,9 +109,6 @@ def surface_score(built: OccupancyMap, points: Tensor) -> float:
     hits = ~built.max_range
     weight, means, covariances = built.support[hits], built.means[hits], built.covariances[hits]
     return GaussianMixture.from_parameters(weight / weight.sum(), means, covariances).score(points)
-
-
-# -- corrected poses -----------------------------------------------------------------------------------
 
 
 def build_by_scan(empty: GaussianMap, scans: Sequence[Scan]) -> list[Tensor]:

@@ -35,12 +35,7 @@ from gmmtorch.experiments.evaluation import (
 )
 from gmmtorch.experiments.studies.study_options import SensorModelStudy
 from gmmtorch.mapping import GaussianMap
-from gmmtorch.mixture import (
-    DeconvolvedGaussianMixture,
-    LidarModel,
-    SensorModel,
-    estimate_normals,
-)
+from gmmtorch.mixture import DeconvolvedGaussianMixture, LidarModel, SensorModel, estimate_normals
 from gmmtorch.report import Event, Row, ignore
 from gmmtorch.scan import Scan
 
@@ -56,11 +51,7 @@ class _Cloud(NamedTuple):
 
 
 def run_sensor_noise(
-    name: str,
-    scans: Sequence[Scan],
-    study: SensorModelStudy,
-    seed: int = 0,
-    on_event: Event = ignore,
+    name: str, scans: Sequence[Scan], study: SensorModelStudy, seed: int = 0, on_event: Event = ignore
 ) -> list[Row]:
     """A row for each variant and size, scored on the held-out scans.
 

@@ -24,9 +24,6 @@ def _check_sizes(n_components: Sequence[int]) -> None:
         check_whole("n_components", k, 1)
 
 
-# -- studies of gmmtorch-occupancy -----------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class ApproximationErrorStudy:
     """Of `studies.approximation_error`, which has no options."""
@@ -109,9 +106,6 @@ class VarianceThresholdStudy:
         _check_sizes(self.n_components)
         if self.railing is not None:
             check_number("railing", self.railing, above=True)
-
-
-# -- studies of gmmtorch-fit -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,6 @@ from gmmtorch.report import Event, OnRows, Row, ignore
 from gmmtorch.scan import Scan
 from gmmtorch.simulation import MeshWorld, box, sense, spinning_lidar
 
-# -- a railing -----------------------------------------------------------------------------------------
-
 _HALF, _HEIGHT = 3.0, 1.1  # half the length and the height (m) of the railing, which lies in the plane y = 0
 _POSTS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
 _BARS = (0.55, _HEIGHT)
@@ -67,8 +65,6 @@ def is_of_railing(scan: Scan, width: float) -> Tensor:
     reach = 0.5 * width + 5 * _NOISE
     return (y.abs() < reach) & (x.abs() < _HALF + reach) & (z > _FLOOR) & (z < _HEIGHT + reach)
 
-
-# -- the study -----------------------------------------------------------------------------------------
 
 _BEHIND = 0.5  # a beam passes a structure if it ends this far behind (m)
 _SIDES = 4  # axes across a beam along which a structure may be narrow

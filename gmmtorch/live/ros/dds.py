@@ -210,9 +210,6 @@ def _text(error: Exception) -> str:
     return str(getattr(error, "msg", "") or error).strip(" .")
 
 
-# -- types ----------------------------------------------------------------------------------------
-
-
 class IdlTypes:
     """Types of cyclonedds for ROS messages, whose structure Cyclone DDS checks and tells others.
 

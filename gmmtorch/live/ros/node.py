@@ -140,8 +140,6 @@ class Node:
         """Leaves the network."""
         self._middleware.close()
 
-    # -- topics ---------------------------------------------------------------------------------------
-
     def publisher(self, topic: str, message_type: str, offered: Quality | None = None) -> Callable[..., None]:
         """Declares a publisher; the result publishes a message from nested fields and a stamp (ns).
 
@@ -202,8 +200,6 @@ class Node:
                 return f"topic {subscription.topic} cannot be received: {reason}"
         return f"topic {subscription.topic} has a publisher, which sends nothing"
 
-    # -- time and transforms --------------------------------------------------------------------------
-
     def now(self) -> int:
         """The time in ns: of the system, or of /clock (0 before its first message)."""
         return time.time_ns() if self._clock_topic is None else self._clock
@@ -224,8 +220,6 @@ class Node:
             self._note_malformed(subscription, error)
             return
         self._clock = int(message["clock"]["sec"]) * 1_000_000_000 + int(message["clock"]["nanosec"])
-
-    # -- messages -------------------------------------------------------------------------------------
 
     def spin(self, seconds: float | None = None) -> None:
         """Calls callbacks for some seconds; None: until it is interrupted."""

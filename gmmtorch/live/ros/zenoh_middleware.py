@@ -160,9 +160,6 @@ def _settings(
     return config
 
 
-# -- keys -----------------------------------------------------------------------------------------
-
-
 def message_key(domain: int, topic: str, message_type: str, type_hash: str) -> str:
     """The key of a topic's messages; hash "*": of any version of the type."""
     return f"{domain}/{topic.strip('/')}/{dds_type(message_type)}/{type_hash}"

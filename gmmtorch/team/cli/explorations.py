@@ -156,8 +156,6 @@ def print_rows(rows: Sequence[Row], columns: Sequence[str]) -> None:
     print_table(rows, columns, title)
 
 
-# -- pictures ---------------------------------------------------------------------------------------
-
 _HALF_BAND = 0.6  # metres above and below the first robot's start that maps from above show
 
 
@@ -277,10 +275,7 @@ class MissionRecorder:
         surfaces = _surfaces(components)
         if surfaces is not None:
             figures["mixture"] = mixture_scene_figure(
-                surfaces.means,
-                surfaces.covariances,
-                seen_from=first_viewpoints(surfaces),
-                trajectories=paths,
+                surfaces.means, surfaces.covariances, seen_from=first_viewpoints(surfaces), trajectories=paths
             )
         return figures
 

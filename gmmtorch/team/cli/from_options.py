@@ -151,8 +151,6 @@ def free_addresses(n: int, kind: socket.SocketKind = socket.SOCK_DGRAM) -> list[
             one.close()
 
 
-# -- missions ----------------------------------------------------------------------------------------
-
 _OF_VARIANTS = {
     "team": "team.name",
     "planner": "planner.name",
@@ -252,8 +250,6 @@ def _changed(config: DictConfig, options: dict[str, Any]) -> DictConfig:
             ) from error
     return changed
 
-
-# -- robots ------------------------------------------------------------------------------------------
 
 _PART = "consecutive"  # each robot's part of the log: a stretch that it could have driven
 _NO_RESTART = (
@@ -397,9 +393,6 @@ def shared_map(config: DictConfig, stack: ExitStack) -> SharedMap | None:
             budget=config.network.budget,
             joiner=FrameJoiner(replica) if is_free else None,
         )
-
-
-# -- the listener ------------------------------------------------------------------------------------
 
 
 def listener(

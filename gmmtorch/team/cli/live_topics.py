@@ -67,9 +67,6 @@ def open_node(config: DictConfig) -> Node:
     return node
 
 
-# -- playing --------------------------------------------------------------------------------------
-
-
 def play(config: DictConfig, node: Node) -> None:
     """Publish a recording, once somebody subscribes to it."""
     with naming({"rate": "speed"}):
@@ -84,9 +81,6 @@ def play(config: DictConfig, node: Node) -> None:
             if is_stopped():
                 break
     print(f"played    {player.n_played:,} of {player.n_messages:,} messages of {config.play}")
-
-
-# -- mapping --------------------------------------------------------------------------------------
 
 
 def build_map(config: DictConfig, node: Node, device: str, shared: SharedMap | None) -> None:

@@ -49,8 +49,7 @@ class LogOptions:
 
     dataset: Any = option(None, "reader of the log, as in dataset@log.dataset=carmen")
     map: Any = option(
-        None,
-        "options of the map that differ from those of map=incremental, as in {name: windowed}",
+        None, "options of the map that differ from those of map=incremental, as in {name: windowed}"
     )
 
 

@@ -168,9 +168,6 @@ def print_refusals(rows: Sequence[dict[str, Any]]) -> None:
             print(f"robot {row['robot']} refused {sum(counts.values()):,} frames: {reasons}{remedy}")
 
 
-# -- files ----------------------------------------------------------------------------------------
-
-
 class Outputs:
     """Writes the files of a run's folder; a failed file does not prevent the next ones."""
 

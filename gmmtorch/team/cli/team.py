@@ -178,9 +178,6 @@ def _prepare(config: DictConfig, bars: ProgressBars) -> None:
             start_poses(world, options)
 
 
-# -- the processes --------------------------------------------------------------------------------
-
-
 def _started(
     config: DictConfig, folder: Path, addresses: list[list[str]], stack: ExitStack
 ) -> list[RobotProcess]:
@@ -235,9 +232,6 @@ def _wait(robots: list[RobotProcess], bars: ProgressBars, listen: Callable[[bool
 def _status(robots: Sequence[RobotProcess]) -> str:
     """The status of one robot after the other."""
     return robots[int(time.monotonic() / _TURN) % len(robots)].last_line()
-
-
-# -- the results ----------------------------------------------------------------------------------
 
 
 def _summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:

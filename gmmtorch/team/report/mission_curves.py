@@ -202,12 +202,7 @@ def _draw_robots(axes: Axes, row: Mapping[str, Any], hue: str) -> bool:
 
 
 def _finished(
-    figure: Figure,
-    axes: Axes,
-    ends: Sequence[LineEnd],
-    rows: Rows,
-    handles: Sequence[Line2D],
-    title: str,
+    figure: Figure, axes: Axes, ends: Sequence[LineEnd], rows: Rows, handles: Sequence[Line2D], title: str
 ) -> Figure:
     """Sets limits and grid, and draws the labels of the lines, legend and title."""
     axes.set_xlim(0, max(float(row["times"][-1]) for row in rows) or 1.0)

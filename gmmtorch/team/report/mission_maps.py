@@ -76,9 +76,7 @@ class TeamSnapshot:
 
 
 def trajectories_figure(
-    world: MapImage,
-    trajectories: Sequence[ArrayLike],
-    coverage: ArrayLike | None = None,
+    world: MapImage, trajectories: Sequence[ArrayLike], coverage: ArrayLike | None = None
 ) -> Figure:
     """Draws the paths of the robots over the world from above, and how many robots saw each place (Fig 1.1).
 
@@ -137,11 +135,7 @@ def team_map_figure(snapshots: Sequence[TeamSnapshot], belief: BeliefRule | None
         axes.label_outer()
     for axes in grid[len(snapshots) :]:
         axes.set_visible(False)
-    handles = [
-        _patch(_FREE, "free"),
-        _patch(_SURFACE, "occupied"),
-        _patch(UNKNOWN, "unknown"),
-    ]
+    handles = [_patch(_FREE, "free"), _patch(_SURFACE, "occupied"), _patch(UNKNOWN, "unknown")]
     if has_components:
         ring = Line2D([], [], color=EDGE, marker="o", fillstyle="none", markersize=9, linestyle="")
         ring.set_label("component, 2σ")

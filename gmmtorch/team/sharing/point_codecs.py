@@ -27,9 +27,6 @@ _LEVEL = 22  # the strongest of zstd
 _LARGEST_OUTPUT = 1 << 26  # bytes that zstd may decompress to
 
 
-# -- cells -------------------------------------------------------------------------------------------------
-
-
 def checked_points(points: Tensor) -> NDArray[np.float64]:
     """Points (N, 3) as float64; raises `InvalidArgumentError` for another shape or values not finite."""
     rows = points.detach().double().cpu().numpy()
@@ -87,9 +84,6 @@ def centers(corner: Ints, codes: Ints, resolution: float) -> Tensor:
     """Centres (N, 3) of the cells with these Morton codes (N,), metres."""
     cells = corner + np.stack([_gather(codes >> 2), _gather(codes >> 1), _gather(codes)], 1)
     return torch.from_numpy((cells + 0.5) * resolution)
-
-
-# -- bytes -------------------------------------------------------------------------------------------------
 
 
 def header(corner: Ints, n: int) -> bytes:

@@ -297,8 +297,6 @@ class Store:
         facts = {"robot": robot, **(facts or {})}
         self._db, self.is_writable = open_file(self.path, facts, max_bytes)
 
-    # -- sessions -----------------------------------------------------------------------------------
-
     def begin_session(self, session: bytes) -> frozenset[bytes]:
         """The robot's earlier sessions. Keeps `session` (8 bytes) with them: call it before anything is sent.
         See `FramedTransport.disown`."""
@@ -312,8 +310,6 @@ class Store:
 
         self._write(add)
         return frozenset(former)
-
-    # -- records ------------------------------------------------------------------------------------
 
     def restore(self, replica: Replica) -> Restored:
         """Load the stored records into a new replica; from now on the store keeps this replica. Damaged rows
@@ -390,8 +386,6 @@ class Store:
         self._patience = self._waited = 0
         return True
 
-    # -- progress in a log --------------------------------------------------------------------------
-
     def save_progress(self, n_scans: int, state: dict[str, Any]) -> bool:
         """Keep the state of the robot's own map after so many scans; returns whether it is on the disk. The
         newest two states are kept, in case one is damaged later."""
@@ -438,8 +432,6 @@ class Store:
         ((n_scans,),) = self._rows("SELECT max(scans) FROM progress")
         return None if n_scans is None else int(n_scans)
 
-    # -- closing ------------------------------------------------------------------------------------
-
     def close(self) -> None:
         """Compact, and close the file. May be called again."""
         self.compact()
@@ -451,8 +443,6 @@ class Store:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    # -- inside -------------------------------------------------------------------------------------
 
     def _rows(self, query: str) -> list[tuple[Any, ...]]:
         try:

@@ -125,8 +125,6 @@ class ViewLibrary:
         )
         return poses.reshape(-1, 4), values, stamps
 
-    # -- changes made here ------------------------------------------------------------------------
-
     def add(self, poses: Tensor, values: Tensor, now: float, least: float, most: int = 8) -> list[int]:
         """Add the best `most` of views (N, 4) with values (N,) of at least `least`; return their keys."""
         added: list[int] = []
@@ -196,8 +194,6 @@ class ViewLibrary:
         if not len(score) or not float(score.max()) > 0:
             return None
         return int(score.argmax())
-
-    # -- the team ---------------------------------------------------------------------------------
 
     def digest(self) -> bytes:
         """8 bytes, equal for equal views. Robots that lost messages may differ."""
@@ -288,8 +284,6 @@ class ViewLibrary:
         """Remove the views that were not valued for the time to live."""
         limit = now - TIME_TO_LIVE
         self._remove([key for key, valued in self._valued_at.items() if valued < limit])
-
-    # -- inside -----------------------------------------------------------------------------------
 
     def _put(self, key: int, view: View, now: float) -> None:
         self._views[key], self._valued_at[key] = view, now

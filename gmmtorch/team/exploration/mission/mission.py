@@ -202,8 +202,6 @@ class Mission:
             raise RuntimeError("This mission has no score.")
         return self._score
 
-    # -- time -------------------------------------------------------------------------------------
-
     @property
     def tick_seconds(self) -> float:
         return self.options.tick_seconds
@@ -274,8 +272,6 @@ class Mission:
         """Writes poses (T, 4) of each robot, one per tick, as arrays robot_0, … of trajectories.npz."""
         poses = {f"robot_{n}": torch.stack(path).numpy() for n, path in enumerate(self.trajectories)}
         write_npz(folder / "trajectories.npz", **poses)
-
-    # -- the stages of a tick ---------------------------------------------------------------------
 
     def _sense(self, agent: Agent, now: float) -> None:
         others = [other.position for other in self.robots if other is not agent.robot]
@@ -367,19 +363,14 @@ def plan_alone(agent: Agent, options: TeamOptions, now: float, number: int) -> N
     paths of the plans that it has heard, and discounts the views of those heard in the last planning
     period."""
     agent.begin_planning(now)
-    heard = agent.robot.plans
-    step = options.dynamics.step
+    heard, dynamics = agent.robot.plans, options.dynamics
     paths = [
-        predicted_path(plan, now - agent.heard_at[peer], step)
+        predicted_path(plan, now - agent.heard_at[peer], dynamics.step)
         for peer, plan in sorted(heard.items())
         if len(plan.path)
     ]
-    agent.propose(
-        now,
-        list(heard),
-        PeerTrajectories.of(paths, options.separation),
-        since=now - options.dynamics.duration,
-    )
+    peers = PeerTrajectories.of(paths, options.separation)
+    agent.propose(now, list(heard), peers, since=now - dynamics.duration)
     agent.follow()
     agent.send_plan(now, number)
     agent.send_views(now)

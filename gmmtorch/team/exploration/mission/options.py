@@ -208,9 +208,7 @@ class TeamOptions(LinkConditions):
         "network.announce",
     )
     budget: float | None = option(
-        None,
-        "bytes per second that each robot sends of its map and views; null: no limit",
-        "network.budget",
+        None, "bytes per second that each robot sends of its map and views; null: no limit", "network.budget"
     )
     sample_every: float = option(10.0, "seconds between the rows of a mission's curves", "evaluation.every")
     codecs: tuple[str, ...] = option(

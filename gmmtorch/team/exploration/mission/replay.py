@@ -99,8 +99,6 @@ class ReplayMission:
         """Changes whenever records are added to the team's map."""
         return self.shared.content()
 
-    # -- the log ----------------------------------------------------------------------------------
-
     def _resume(self) -> int:
         """Restores the map as it was saved last; returns the position then."""
         if self._store is None:

@@ -127,10 +127,7 @@ def _finite(name: str, values: ArrayLike, n_axes: int) -> np.ndarray:
 
 
 PLANNING = ("planner", "information", "coordination", "planning_prior")
-NETWORK = (
-    *("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions"),
-    *("announce", "budget"),
-)
+NETWORK = ("delay", "jitter", "bandwidth", "loss", "duplication", "reach", "partitions", "announce", "budget")
 VARIANT = ("framework", *PLANNING, *THESIS, *NETWORK)
 """Fields of a row that say which variant of a study it belongs to."""
 _LOSSES = ("loss", "partitions")
@@ -194,9 +191,6 @@ def mission_row(mission: Mission, wall_seconds: float) -> dict[str, Any]:
         "stage_seconds": dict(mission.watch.seconds),
         "simulated_per_wall_seconds": mission.elapsed / wall_seconds if wall_seconds > 0 else None,
     }
-
-
-# -- missions side by side ------------------------------------------------------------------------
 
 
 def variant_of(

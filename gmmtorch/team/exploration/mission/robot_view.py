@@ -21,12 +21,7 @@ from gmmtorch.team.exploration.mission.replay import ReplayMission
 from gmmtorch.team.exploration.robot.agent import Agent
 from gmmtorch.team.exploration.robot.mapper import GmmMapper, Mapper
 from gmmtorch.team.exploration.world.scoring import BeliefMap
-from gmmtorch.team.sharing import (
-    FramedTransport,
-    Network,
-    PlanMessage,
-    Replica,
-)
+from gmmtorch.team.sharing import FramedTransport, Network, PlanMessage, Replica
 
 Files = Mapping[str, tuple[str, Callable[[Path], object]]]
 """By name: the file name, and what writes the file to a path."""

@@ -341,8 +341,6 @@ def _touched(
     return row[hit], found[hit]
 
 
-# -- other robots -------------------------------------------------------------------------------------
-
 _MOST_STEPS = 1000  # largest number of steps of a received plan that are used
 
 

@@ -170,8 +170,6 @@ class _Tree:
             progress=float(self._metres[0] - self._metres[last.number]),
         )
 
-    # -- choosing leaves --------------------------------------------------------------------------
-
     def _select(self, turn: int) -> _Node | None:
         """Return a new node below the most promising one; None if none remains in this round."""
         root = self._nodes[0]
@@ -211,8 +209,6 @@ class _Tree:
         for node in child.path():
             node.visits += 1
         return child
-
-    # -- values of nodes and their continuations ---------------------------------------------------
 
     def _extend(self, nodes: list[_Node], is_last: bool = False) -> None:
         """Set the states and values of the newest nodes, and find the primitives that can follow them."""
@@ -311,13 +307,7 @@ class _FusedTree(_Tree):
             views = rows, *self._memory.tables
         primitives = self._primitives
         tree.open(
-            primitives.library,
-            self._space,
-            primitives.longest,
-            self._space.resolution,
-            n,
-            is_last,
-            views,
+            primitives.library, self._space, primitives.longest, self._space.resolution, n, is_last, views
         )
         return self._orders()
 

@@ -23,12 +23,7 @@ _NEGLIGIBLE = 1e-5  # values of the depth kernel below this count as zero
 
 
 def beam_templates(
-    horizontal_fov: float,
-    vertical_fov: float,
-    max_range: float,
-    resolution: float,
-    n_beams: int,
-    n_yaws: int,
+    horizontal_fov: float, vertical_fov: float, max_range: float, resolution: float, n_beams: int, n_yaws: int
 ) -> tuple[Tensor, ...]:
     """Templates of a pinhole camera that looks along its heading with pitch 0, from the centre of its cell: Y
     headings, yaw k is 2πk/n_yaws; B beams each, up to C cells a beam.

@@ -280,8 +280,6 @@ class Agent:
         self.robot.mapper.center_on(self.robot.position)
         self.robot.mapper.receive([])
 
-    # -- sensing ----------------------------------------------------------------------------------
-
     def capture(self, mesh: MeshWorld, others: Tensor) -> DepthFrame:
         """A depth image of the world, in which teammates at (M, 3) are masked."""
         with self.watch("rendering"):
@@ -301,8 +299,6 @@ class Agent:
         with self.watch("sharing"):
             self.send_map(now)
         return update
-
-    # -- messages ---------------------------------------------------------------------------------
 
     def send_map(self, now: float) -> None:
         """Sends what is due of the map, and announcements if they are due; less than a datagram once
@@ -385,8 +381,6 @@ class Agent:
     def _longest_hold(self) -> float:
         """Seconds for which components wait until they are sent, at most."""
         return max(self.options.dynamics.duration, self.options.announce_every)
-
-    # -- planning ---------------------------------------------------------------------------------
 
     def begin_planning(self, now: float) -> None:
         """Takes the snapshot of the map that `propose` uses. Later messages do not change it."""

@@ -221,8 +221,6 @@ class GridMapper(Mapper):
         return self._memo(tuple(datagrams), make)
 
 
-# -- mixtures -----------------------------------------------------------------------------------------
-
 _LEEWAY = 0.5  # cells
 _EMPTY_RAYS = 0.75  # of the rays of components of surfaces: components of free space overlap far more
 _EMPTY_CUTOFF = 2.0
@@ -294,8 +292,6 @@ class GmmMapper(Mapper):
         self._by_rays, self._by_explained = _Boxes(), _Boxes()
         self._by_origin: dict[tuple[int, ...], list[Components]] = {}  # batches by the cell of their origins
         self._near: tuple[list[Components], Components] | None = None  # the last `_seen_from_near`
-
-    # -- sensing ----------------------------------------------------------------------------------
 
     def center_on(self, position: Tensor) -> None:
         for uncovered in self.local.center_on(position):
@@ -396,8 +392,6 @@ class GmmMapper(Mapper):
     def _origin_cell(self, origin: Tensor) -> tuple[int, ...]:
         """The cell of `_by_origin` that contains a place (3,)."""
         return tuple((origin / self._novelty.distance).floor().long().tolist())
-
-    # -- the mixture ------------------------------------------------------------------------------
 
     def receive(self, received: Sequence[ReceivedMessage]) -> list[bytes]:
         merged = [item.datagram for item in received if self.shared.receive(item.datagram, item.message)]

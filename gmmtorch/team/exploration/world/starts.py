@@ -172,9 +172,6 @@ def _far_end(world: World) -> Tensor:
     return places[torch.where(low if bool(low.any()) else roomy, off, -1.0).argmax()]
 
 
-# -- the free space around a start -------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class InitialFreeSpace:
     """What a robot knows before its first frame.

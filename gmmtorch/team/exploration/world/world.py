@@ -288,9 +288,6 @@ def open_world(
     return World.from_mesh(triangles, bounds=bounds, name=name, **options)
 
 
-# -- cells: navigable, observable, and collisions ------------------------------------------------------
-
-
 def occupied_and_clear(
     mesh: MeshWorld,
     triangles: Tensor,

@@ -306,9 +306,6 @@ def _values(steps: Ints) -> NDArray[np.float64]:
     return np.where(steps < 0, -size, size)
 
 
-# -- poses and times ------------------------------------------------------------------------------------
-
-
 def quantized_poses(poses: Tensor) -> Tensor:
     """Poses (N, 4) of a path as plans round them: to 1 cm and 1/256 of a turn, yaw in [−π, π)."""
     return _poses(_pose_steps("poses", poses))

@@ -116,8 +116,6 @@ class Author:
         """The keys that this author has given."""
         return Intervals.span(self._first, self._first + self._n)
 
-    # -- components -------------------------------------------------------------------------------
-
     def publish(self, components: Components, old: Intervals) -> Published:
         """Write new components, which supersede the records `old` of this robot."""
         if most_viewpoints(components) > MOST_VIEWPOINTS:
@@ -190,8 +188,6 @@ class Author:
         """The keys, rising, of this robot's components that count."""
         keys = self._records.table.keys()
         return keys[self._keys_of_robot.contains(keys)].tolist()
-
-    # -- counters and corrections -----------------------------------------------------------------
 
     def count(self, gains: Mapping[int, float]) -> Intervals:
         """Add points to this author's counters, by keys of components of any robot; returns the new
@@ -275,8 +271,6 @@ class Author:
             written |= self._write(replace(message, key=self._first + self._n))
             self._written_steps.update(zip(message.components.tolist(), message.steps.tolist(), strict=True))
         return written
-
-    # -- superseding ------------------------------------------------------------------------------
 
     def _replace(self, before: Sequence[RecordMessage], written: Intervals) -> Intervals:
         """Supersede records by those that were written for them; returns all new records."""

@@ -245,9 +245,6 @@ def _largest_of(records: Iterable[CountersMessage]) -> _Row:
     return keys[is_largest], steps[is_largest]
 
 
-# -- points ---------------------------------------------------------------------------------------------
-
-
 def gains(components: Components, gain: Tensor) -> Components:
     """Components (K,) whose support and counts are the points (K,) that they gain. The points are distributed
     over a component's viewpoints in proportion to their counts."""
@@ -266,9 +263,6 @@ def with_gains(components: Components, gain: Tensor) -> Components:
         support=components.support + more.support,
         seen_count=components.seen_count + more.seen_count,
     )
-
-
-# -- corrections and frames -----------------------------------------------------------------------------
 
 
 def latest(records: Sequence[CorrectionMessage]) -> list[CorrectionMessage]:
@@ -396,8 +390,6 @@ def _at(motions: Tensor, points: Tensor) -> Tensor:
     """Points (N, D) transformed by motions (N, D+1, D+1)."""
     return (motions[:, :-1, :-1] @ points[:, :, None]).squeeze(2) + motions[:, :-1, -1]
 
-
-# -- changes --------------------------------------------------------------------------------------------
 
 _MOST_KEYS = 1 << 16
 """Keys of components with new counters that are remembered between two calls; of more, all counters are

@@ -122,8 +122,6 @@ class Records:
         self._log = ChangeLog()
         self._view: tuple[int, Components] | None = None
 
-    # -- adding -----------------------------------------------------------------------------------
-
     @property
     def known(self) -> Intervals:
         """The held keys, with those of channels if a robot of the team knows channels."""
@@ -318,8 +316,6 @@ class Records:
         if not all(before.place(one).equals(self.frames.place(one)) for one in reported):
             self._log.invalidate()
 
-    # -- reading ----------------------------------------------------------------------------------
-
     def of(self, kind: type[_Record]) -> list[_Record]:
         """The stored records of a type, by key."""
         found = self._kinds.get(kind, {})
@@ -375,8 +371,6 @@ class Records:
         for key in sorted(self.others):
             digest.update(self.datagrams[key])
         return digest.digest()
-
-    # -- saving -----------------------------------------------------------------------------------
 
     def stored(self) -> tuple[list[bytes], list[bytes]]:
         """Codec batches of all components that count, and the datagrams of the other records that count."""

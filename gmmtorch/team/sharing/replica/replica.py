@@ -106,8 +106,6 @@ class Replica:
         if own_frame:
             self._backlog.add(self._author.place_frame(self._own, self._own, None))
 
-    # -- writing ----------------------------------------------------------------------------------
-
     def add(self, new: GaussianMap | Components, supersedes: ArrayLike | None = None) -> Tensor:
         """Write new records of this robot; returns their ids (K, 2).
 
@@ -204,8 +202,6 @@ class Replica:
         self._backlog.add(written)
         return ids_of(keys)
 
-    # -- sending and receiving --------------------------------------------------------------------
-
     def datagrams(self, max_bytes: int = MAX_BYTES, budget: int | None = None) -> list[bytes]:
         """Datagrams of the records that are due: new ones, and those that other robots lack.
 
@@ -294,8 +290,6 @@ class Replica:
     def _check_id(self, is_duplicate: object) -> None:
         if is_duplicate:
             raise RefusedError("duplicate_id", self.robot, f"Another robot uses the id {self.robot}.")
-
-    # -- reading ----------------------------------------------------------------------------------
 
     def digest(self) -> bytes:
         """16 bytes, equal for equal contents in any order of arrival."""
@@ -400,8 +394,6 @@ class Replica:
     def n_components(self) -> int:
         """Number of components that are held."""
         return len(self._records.table)
-
-    # -- storing ----------------------------------------------------------------------------------
 
     def stored(self) -> tuple[list[bytes], list[bytes]]:
         """All records that count, for a `Store`: codec batches of components, and datagrams of the others."""

@@ -55,8 +55,6 @@ class FramedTransport(ABC):
     def _shut(self) -> None:
         """Stop listening, and release resources. Called once."""
 
-    # -- the transport -------------------------------------------------------------------------------------
-
     def send(self, sender: int, datagrams: Sequence[bytes], now: float, kind: str) -> None:
         """Broadcast datagrams of at most 1200 bytes; `sender` must be this robot. See `Transport`. Does not
         wait: datagrams that the network does not take at once are lost."""
@@ -97,8 +95,6 @@ class FramedTransport(ABC):
     def n_neighbours(self) -> int | None:
         """Connections to others now; None if the network has no connections."""
         return None
-
-    # -- statistics ----------------------------------------------------------------------------------------
 
     def traffic(self, sender: int | None = None, kind: str | None = None) -> Traffic:
         """What this robot has broadcast, as `Network` counts: each datagram once, without its frame."""
@@ -151,8 +147,6 @@ class FramedTransport(ABC):
         """Robot ids that two robots use, with the addresses and sessions of both."""
         return self._opener.duplicates
 
-    # -- closing -------------------------------------------------------------------------------------------
-
     def close(self) -> None:
         """Stop listening, and drop the queue. May be called again."""
         if not self._closing.is_set():
@@ -164,8 +158,6 @@ class FramedTransport(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    # -- inside --------------------------------------------------------------------------------------------
 
     def _check_robot(self, name: str, robot: int) -> None:
         if robot != self.robot:

@@ -18,13 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gmmtorch.errors import (
-    DataError,
-    GmmTorchError,
-    InvalidArgumentError,
-    MissingDataError,
-    check_whole,
-)
+from gmmtorch.errors import DataError, GmmTorchError, InvalidArgumentError, MissingDataError, check_whole
 from gmmtorch.optional_packages import needs_extra
 from gmmtorch.team.sharing.messages.datagrams import MAX_BYTES, check_datagram
 

@@ -132,8 +132,6 @@ class UdpTransport(FramedTransport):
         _check_peers(peers, self.address)
         self._peers = list(peers)
 
-    # -- inside --------------------------------------------------------------------------------------------
-
     def _carry(self, frame: bytes, kind: str) -> Traffic:
         """Send a copy to each peer."""
         n_sent = n_bytes = 0
@@ -193,9 +191,6 @@ class UdpTransport(FramedTransport):
     def _failed(self, error: OSError, direction: str) -> None:
         name = errno.errorcode.get(error.errno or 0, "unknown")
         self._count_failure(name, f"{error.strerror}", direction)
-
-
-# -- sockets -----------------------------------------------------------------------------------------------
 
 
 def unicast_socket(address: Address) -> socket.socket:

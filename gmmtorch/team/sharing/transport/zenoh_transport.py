@@ -224,8 +224,6 @@ class ZenohTransport(FramedTransport):
         info = self._session.info
         return len(info.peers_zid()) + len(info.routers_zid())
 
-    # -- inside --------------------------------------------------------------------------------------------
-
     def _declare(self, zenoh: Any, team: str) -> None:
         """Declare the publishers and the subscriber."""
         own, team_keys = f"gmmtorch/{team}/{self.robot}", f"gmmtorch/{team}/*"
