@@ -12,12 +12,16 @@ import resource
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from copy import deepcopy
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal import config_loader_impl
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.defaults_list import DefaultsList, create_defaults_list
 from hydra._internal.hydra import Hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
@@ -31,10 +35,36 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 CONF = Path(common.conf_dir())
 
 
-# For each configuration Hydra copies the store of all schemas, and then again each schema that it takes; and
-# it composes that of a run once more, to see whether it sets `hydra.mode`. Tests compose a thousand.
+# Tests compose a thousand configurations of some fifty choices of groups. Hydra copies the store of all
+# schemas for each, and composes that of a run once more to see whether it sets `hydra.mode`. Here each choice
+# is composed once, and options are applied to copies of it.
 ConfigStore.__deepcopy__ = lambda store, memo: store
 Hydra.get_mode = lambda hydra, config_name, overrides: None
+_CHOSEN: dict[str, DefaultsList] = {}
+_MERGED: dict[str, DictConfig] = {}
+
+
+def _chosen_once(repo: Any, config_name: str, overrides_list: list[Any], **how: Any) -> DefaultsList:
+    given = [one for one in overrides_list if not one.is_sweep_override()]
+    groups = [
+        one for one in given if repo.group_exists(one.key_or_group) and not isinstance(one.value(), dict)
+    ]
+    key = repr((config_name, [one.input_line for one in groups], how, repo.get_sources()))
+    if key not in _CHOSEN:
+        _CHOSEN[key] = create_defaults_list(repo, config_name, groups, **how)
+    return replace(_CHOSEN[key], config_overrides=[one for one in given if one not in groups])
+
+
+def _merged_once(loader: ConfigLoaderImpl, defaults: list[Any], repo: Any) -> DictConfig:
+    key = repr((defaults, repo.get_sources()))
+    if key not in _MERGED:
+        _MERGED[key] = merge(loader, defaults, repo)
+    return deepcopy(_MERGED[key])
+
+
+merge = ConfigLoaderImpl._compose_config_from_defaults_list
+config_loader_impl.create_defaults_list = _chosen_once
+ConfigLoaderImpl._compose_config_from_defaults_list = _merged_once
 
 
 def register_schemas() -> None:
