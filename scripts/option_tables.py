@@ -43,17 +43,23 @@ def _register() -> None:
 
 
 @functools.cache
-def rows_of(command: str) -> list[Row]:
-    """All options of a command, those of every choice of its groups included."""
+def groups_of(command: str) -> dict[str, list[str]]:
+    """The choices of the groups of a command, by the first part of the names of their options."""
     _register()
     groups = {name: chosen for name, chosen in options_help.groups_of(command).items() if "@" not in name}
-    found: dict[str, Row] = {}
-    for group, choice in [("", ""), *((g, c) for g, chosen in groups.items() for c in chosen)]:
+    return {{"experiment": "study"}.get(name, name): chosen for name, chosen in groups.items()}
+
+
+@functools.cache
+def rows_of(command: str, first: str) -> list[Row]:
+    """The options of every choice of a group of a command, or ("") those that are of no group."""
+    groups, found = groups_of(command), dict[str, Row]()
+    group = {"study": "experiment"}.get(first, first)
+    for choice in groups.get(first, [""]):
         config = options_help.configuration(command, [f"{group}={choice}"] if group else [])
         for option in options_help.options_of(config):
-            first = option.name.split(".")[0]
-            is_of_group = first == {"experiment": "study"}.get(group, group)
-            if is_of_group or (not group and first not in groups):
+            part = option.name.split(".")[0]
+            if part == first or (not first and part not in groups):
                 row = found.setdefault(option.name, Row(option.name, option.about, {}))
                 row.defaults[choice] = options_help.text_of_value(option.value)
     return list(found.values())
@@ -62,18 +68,18 @@ def rows_of(command: str) -> list[Row]:
 def table(command: str, parts: list[str]) -> str:
     """The table of the options whose names begin with these parts."""
     lines = ["| option | default | meaning |", "|---|---|---|"]
-    _register()
-    groups = options_help.groups_of(command)
+    groups = groups_of(command)
     chosen = options_help.configuration(command).hydra.runtime.choices
     for name in parts:
-        if name in groups:
+        if name in groups and name != "study":
             lines.append(f"| `{name}` | `{chosen[name]}` | {', '.join(f'`{c}`' for c in groups[name])} |")
-    for row in rows_of(command):
+    for row in [
+        row for first in ("", *groups) if not first or first in parts for row in rows_of(command, first)
+    ]:
         first = row.name.split(".")[0]
         if first not in parts:
             continue
-        choices = groups.get({"study": "experiment"}.get(first, first), [])
-        only = _only(row, choices)
+        only = _only(row, groups.get(first, []))
         lines.append(f"| `{row.name}` | {_default(row)} | {only}{row.about.replace('|', chr(92) + '|')} |")
     return "\n".join(lines)
 
@@ -99,7 +105,14 @@ def written(page: str) -> str:
 
 def names() -> set[str]:
     """The distinct names of the options of all commands, with every choice of their groups."""
-    return {row.name for command in COMMANDS for row in rows_of(command)}
+    # A group with the same choices has the same options in every command.
+    groups = {
+        (first, *chosen): (command, first)
+        for command in COMMANDS
+        for first, chosen in groups_of(command).items()
+    }
+    wanted = [*((command, "") for command in COMMANDS), *groups.values()]
+    return {row.name for command, first in wanted for row in rows_of(command, first)}
 
 
 if __name__ == "__main__":
