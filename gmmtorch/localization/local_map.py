@@ -246,7 +246,10 @@ class LocalMap:
         angle: float,
         most: int,
     ) -> Pose:
-        """Some poses, and the best starts around them: `spacing` metres and up to `angle` radians apart."""
+        """Some poses, and at most `most` of the best starts around them.
+
+        They are `spacing` metres apart, with headings up to `angle` radians from those of the poses.
+        """
         reach = math.ceil(min(2 * expected.distance, _FARTHEST) / spacing)
         side = torch.arange(-reach, reach + 1).double() * spacing
         shifts = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, self.dim - 2))

@@ -76,10 +76,12 @@ def measured_motion(motion: ArrayLike, dim: int, device: torch.device) -> Pose |
 
 
 def continued(rotation: Tensor, last: Pose | None, ratio: float = 1.0) -> Pose:
-    """The motion with a measured rotation (D, D) at the velocity of the last one, if it is known. The
-    velocity v in the frame of the sensor stays, and takes effect while the sensor turns by ω: the translation
-    is t = J(ω) v with J(ω) = ∫₀¹ exp(s [ω]) ds. `ratio`: how many times longer than the last motion this one
-    takes."""
+    """The motion with a measured rotation (D, D) at the velocity of the last one, if it is known.
+
+    The velocity v in the frame of the sensor stays, and takes effect while the sensor turns by ω: the
+    translation is t = J(ω) v with J(ω) = ∫₀¹ exp(s [ω]) ds. `ratio`: how many times longer than the last
+    motion this one takes.
+    """
     if last is None:
         return _turned(rotation)
     velocity = torch.linalg.solve(_mean_rotation(last.rotation), last.translation)

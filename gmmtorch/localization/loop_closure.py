@@ -107,10 +107,12 @@ def closed(
 
 
 class _Revision:
-    """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans. A motion
-    is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and this is
-    likelier by far than all other poses. A pose is replaced, in the same way, by that in the map of the
-    keyframes on both sides."""
+    """A trajectory in 2D, whose doubtful motions and poses are estimated again from several scans.
+
+    A motion is replaced if the keyframes after it, together, lie elsewhere in the map of those before it, and
+    this is likelier by far than all other poses. A pose is replaced, in the same way, by that in the map of
+    the keyframes on both sides.
+    """
 
     def __init__(
         self,
@@ -283,8 +285,10 @@ class LoopCloser:
         return n > _APART and n % _SPACING == 1
 
     def corrected(self, keyframes: Sequence[Keyframe], edges: Edges) -> Pose | None:
-        """Corrected poses (K) of K keyframes if the newest one closes a loop, otherwise None. edges: of
-        odometry, between successive keyframes."""
+        """Corrected poses (K) of K keyframes if the newest one closes a loop, otherwise None.
+
+        edges: of odometry, between successive keyframes.
+        """
         poses = Pose.stack([frame.pose for frame in keyframes])
         pairs = _candidates(poses.translation, [len(keyframes) - 1])
         places = list(enumerate(keyframes))
@@ -326,9 +330,11 @@ def _edges(closures: Sequence[_Closure]) -> Edges:
 def _candidates(
     at: Tensor, rows: Sequence[int] | None = None, parts: Tensor | None = None
 ) -> list[tuple[int, int]]:
-    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest. at:
-    positions (K, D) of the keyframes. rows: new ones; None: every third. parts: (K,), see `closed`: of other
-    parts, keyframes may be nearer in time, but a part of one or two is no map to search in."""
+    """Pairs (old, new) of rows of keyframes that may be at one place: for each new one, the nearest.
+
+    at: positions (K, D) of the keyframes. rows: new ones; None: every third. parts: (K,), see `closed`: of
+    other parts, keyframes may be nearer in time, but a part of one or two is no map to search in.
+    """
     if not len(at):
         return []
     path = torch.cat([torch.zeros(1), (at[1:] - at[:-1]).norm(dim=1)]).cumsum(0)

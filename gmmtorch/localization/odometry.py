@@ -356,7 +356,9 @@ class Odometry:
             self._search_again(lost[0])
 
     def _search_again(self, scan: Keyframe) -> None:
-        """The last scan but one, if it alone was lost, between the poses on both sides of it."""
+        """The last scan but one, which was lost, between the poses on both sides of it. Of several lost scans
+        in a row none is searched for: the pose that ends them is less sure.
+        """
         if self._local is None or len(scan.points) < _FEWEST:
             return
         number, last = len(self._poses) - 2, self._last_frame
@@ -533,8 +535,10 @@ class KissIcp:
         self._locations: list[Location] = []
 
     def add(self, points: Tensor, *unused: object, seconds: object = None) -> Location:
-        """The pose of the next scan in the frame of the first one, without a covariance (NaN). The other
-        arguments of `Odometry.add` are not used."""
+        """The pose of the next scan in the frame of the first one, without a covariance (NaN).
+
+        The other arguments of `Odometry.add` are not used.
+        """
         dim = points.shape[1]
         rows = torch.nn.functional.pad(points, (0, 3 - dim))
         if len(rows):

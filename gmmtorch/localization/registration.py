@@ -240,7 +240,10 @@ def _blurs(
 
 
 def _levels(mixture: Parameters, blurs: list[float]) -> list[Parameters]:
-    """For each blur s, the mixture with ½ s² I added to every covariance; small components are merged."""
+    """For each blur s, the mixture with ½ s² I added to every covariance.
+
+    Once s exceeds the components' size, those in a cell of side s are merged first.
+    """
     size = float(deviations(mixture)[:, -1].median())
     eye = torch.eye(mixture.means.shape[1]).to(mixture.means)
     levels = []
@@ -281,7 +284,9 @@ def _world(motions: Pose, here: Tensor, there: Tensor) -> Pose:
 
 
 def _promising(motions: Pose, log_score: Tensor, radius: float, apart: float) -> Tensor:
-    """The best motions by falling score, without those within `apart` (m) of a better one."""
+    """The best motions by falling score, without those within `apart` (m) of a better one or far below
+    the best.
+    """
     order = log_score.argsort(descending=True, stable=True)
     rotations, translations = motions[order].parts
     turn = torch.linalg.matrix_norm(rotations[:, None] - rotations) / math.sqrt(2)
@@ -320,9 +325,12 @@ def _doubts(share: list[float], width: float, radius: float, converged: bool) ->
 
 class Overlap(NamedTuple):
     """Of B motions: log S (B,), −∞ where no pair is near; its gradient (B, F) over F = D + D(D−1)/2 degrees
-    of freedom (v, ω); the mean information of a pair (B, F, F), JᵀWJ and ½ tr(W ∂C W ∂C); and the covariance
-    of the pairs' gradients (B, F, F). Pairs are weighted by their share of S. Information less covariance
-    approximates −∇² log S, as the missing information of EM does (Louis 1982)."""
+    of freedom (v, ω); the mean information of a pair (B, F, F), JᵀWJ and ½ tr(W ∂C W ∂C); and the
+    covariance of the pairs' gradients (B, F, F).
+
+    Pairs are weighted by their share of S. Information less covariance approximates −∇² log S, as the
+    missing information of EM does (Louis 1982).
+    """
 
     log_score: Tensor
     gradient: Tensor
@@ -334,8 +342,10 @@ class Overlap(NamedTuple):
 
 
 def overlap(source: Parameters, target: Parameters, motions: Pose, pairs: Tensor) -> Overlap:
-    """Log score, gradient, information and scatter of each motion, over the given pairs only. pairs: (3, P),
-    rows of the motion, of the source's and of the target's component."""
+    """Log score, gradient, information and scatter of each motion, over the given pairs only.
+
+    pairs: (3, P), rows of the motion, of the source's and of the target's component.
+    """
     n, dim = motions.translation.shape
     n_free = dim + dim * (dim - 1) // 2
     lever = torch.einsum("bij,kj->bki", motions.rotation, source.means)
@@ -408,10 +418,12 @@ class Ascent:
         return overlap(self.source, self.target, motions, pairs)
 
     def _steps(self, state: Overlap) -> Tensor:
-        """Ascent steps (B, F). In coordinates in which the information is the identity, lengths are the
-        Mahalanobis distances that pairs move by, so their limit lets a wall slide far along itself. There
-        each axis of the Hessian takes Newton's step with the curvature's absolute value, which climbs where
-        the score is convex, too."""
+        """Ascent steps (B, F).
+
+        In coordinates in which the information is the identity, lengths are the Mahalanobis distances that
+        pairs move by, so their limit lets a wall slide far along itself. There each axis of the Hessian takes
+        Newton's step with the curvature's absolute value, which climbs where the score is convex, too.
+        """
         outer = self.scale[:, None] * self.scale
         fisher = state.information * outer
         ridge = 1e-9 * fisher.diagonal(dim1=1, dim2=2).amax(1).clamp_min(1e-12)

@@ -210,8 +210,10 @@ class Tracker:
 
     def _tilts(self, cloud: Tensor) -> tuple[Tensor, Tensor]:
         """Axes (A, 3) of the sensor, and the axis (A, 3) of the map to which each may be turned. The first
-        `_LIKELY` are those of a sensor that is held about upright. Most of the flat area of a scan is
-        parallel to most of that of the map, or perpendicular to it."""
+        `_LIKELY` are those of a sensor that is held about upright.
+
+        Most of the flat area of a scan is parallel to most of that of the map, or perpendicular to it.
+        """
         up = self._center.new_tensor([0.0, 0.0, 1.0])
         main = up if self._main is None else self._main * (1 - 2 * (self._main[2] < 0))
         ones = torch.ones(len(cloud)).to(cloud)

@@ -55,10 +55,13 @@ class BuildProgress:
 
 @dataclass
 class BuildRecord:
-    """The state of a builder, besides its map. n_read: scans that were read. indices: of the scans in the
-    map. n_points: their returns. metres: length of the path through their origins. skipped: number of scans
-    left out while reading, by the reason. history: rows of (n_read, n_components, nbytes, metres, seconds,
-    memory_bytes) at the ends of windows. seconds: computing time of all runs."""
+    """The state of a builder, besides its map.
+
+    n_read: scans that were read. indices: of the scans in the map. n_points: their returns. metres: length of
+    the path through their origins. skipped: number of scans left out while reading, by the reason. history:
+    rows of (n_read, n_components, nbytes, metres, seconds, memory_bytes) at the ends of windows. seconds:
+    computing time of all runs.
+    """
 
     n_read: int = 0
     indices: list[int] = field(default_factory=list)
@@ -424,7 +427,9 @@ def _members(components: Components, find: Callable[[Tensor], Tensor]) -> tuple[
 
 def _moved(components: Components, motions: Tensor, windows: Tensor, of_origins: Tensor) -> Components:
     """Components and origins moved by the motions of their windows, to the bit the same for the identity.
-    motions: (W+1, D+1, D+1); the last one is the identity, for the window −1."""
+
+    motions: (W+1, D+1, D+1); the last one is the identity, for the window −1.
+    """
     stay = torch.tensor([_is_identity(motion) for motion in motions])
     device = components.means.device
     motion, turn = motions[windows].to(device), motions[windows, :-1, :-1].to(device)

@@ -144,7 +144,8 @@ class MapState(DeviceModule):
         return Components.concatenate([*self._parts_before, self._upcoming()[0]])
 
     def _upcoming(self) -> tuple[Components, int]:
-        """The last block with the components of the unfinished window, and the number of the next new one."""
+        """The last block with the components of the unfinished window, not rounded; and the number of the
+        next new one after them."""
         if not self._pending:
             return self._last, self._next_number
         if self._learned is None:
@@ -189,7 +190,9 @@ class MapState(DeviceModule):
         before: windows.BeforeWindow | None = None,
     ) -> tuple[Components, int]:
         """`_upcoming`, with the components of scans, or of frames whose points each stand for `weight`.
-        before: is called with each window before it is learned, see `absorb`."""
+
+        before: is called with each window before it is learned, see `absorb`.
+        """
         known = self._last
         if isinstance(rule, WindowedRule):
             window = as_scans(scans)
@@ -203,8 +206,10 @@ class MapState(DeviceModule):
         return made.to(known.means.device), next_number
 
     def _add(self, scan: Scan) -> None:
-        """Adds a scan to the window, and makes the window final once it is full. A scan that cannot be
-        learned from is removed again."""
+        """Adds a scan to the window, and makes the window final once it is full.
+
+        A scan that cannot be learned from is removed again.
+        """
         self._forget()
         self._pending.append(scan)
         if len(self._pending) < (self.learning.fitted(self._pending).window or _LONGEST_WINDOW):
@@ -237,9 +242,11 @@ class MapState(DeviceModule):
             raise InvalidArgumentError(f"{what} {dim}-dimensional, but the map is {self.dim}-dimensional.")
 
     def _commit(self, components: Components, next_number: int | None = None) -> None:
-        """Ends the unfinished window: replaces the last block, or all components. `next_number`: of the next
-        new component after those of the last block; None: all are replaced, and it is the one after all
-        ids."""
+        """Ends the unfinished window: replaces the last block, or all components.
+
+        `next_number`: of the next new component after those of the last block; None: all are replaced, and it
+        is the one after all ids.
+        """
         self.learning = self._next_rule
         self._doubts = self._next_doubts
         self._n_windows += bool(self._pending)

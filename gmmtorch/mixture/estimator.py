@@ -38,8 +38,10 @@ from gmmtorch.pose import Pose
 
 
 class Report:
-    """Passes the bounds of one start on, and prints every `interval`-th iteration if `verbose`; if 2, with
-    seconds and the change of the bound."""
+    """Receives the bounds of one start, prints every `interval`-th iteration, and passes all bounds on.
+
+    verbose: 0 prints nothing, 1 the iterations, 2 also the seconds and the change of the bound.
+    """
 
     def __init__(self, start: int, verbose: int, interval: int, on_iteration: OnIteration | None) -> None:
         self._verbose, self._interval, self._pass_on = verbose, interval, on_iteration
@@ -187,7 +189,11 @@ class MixtureEstimator(MixtureDensity):
         return self
 
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
-        """Fit the mixture to a prepared cloud and store the result with `_store_fit`."""
+        """Fit the mixture to a prepared cloud and store the result with `_store_fit`.
+
+        Only `fit` of this class calls it. It is not abstract, because a subclass with a `fit` of its own has
+        none.
+        """
         raise NotImplementedError(f"{type(self).__name__} must define _learn, or a fit of its own.")
 
     def fit_predict(self, X: Array, y: Any = None, sample_weight: Array | None = None) -> Array:
@@ -197,8 +203,11 @@ class MixtureEstimator(MixtureDensity):
     # -- steps that every fit begins and ends with ------------------------------------------------
 
     def _prepare(self, X: Array, sample_weight: Array | None, reset: bool = True) -> Cloud:
-        """The checked points of non-zero weight, relative to their weighted mean. Without `reset` they extend
-        an earlier fit: D must match, and there may be fewer points than components."""
+        """The checked points of non-zero weight, relative to their weighted mean.
+
+        Without `reset` the points extend an earlier fit: D must match, and there may be fewer points
+        than components.
+        """
         self.check_parameters()
         points = self._as_points(X, reset=reset).detach()
         warn_if_coarse(X, points)
@@ -249,7 +258,9 @@ class MixtureEstimator(MixtureDensity):
         self, run: Callable[[OnIteration], EMResult[State]], on_iteration: OnIteration | None
     ) -> EMResult[State]:
         """The result with the largest bound of `n_init` starts, or of the one that continues the last fit.
-        `run` makes one start and passes the bounds on. Raises `NumericalError` if a component collapses."""
+
+        `run` makes one start and passes the bounds on. Raises `NumericalError` if a component collapses.
+        """
         best: EMResult[State] | None = None
         verbose, interval = int(getattr(self, "verbose", 0)), int(getattr(self, "verbose_interval", 10))
         for start in range(1 if self._continues() else self.n_init):
@@ -327,8 +338,11 @@ class MixtureEstimator(MixtureDensity):
         return {name: getattr(self, name) for name in self._extra_names if name in self._buffers}
 
     def _set_extra(self, tensors: Mapping[str, Tensor]) -> None:
-        """Replace the extra tensors, after the weights, means and covariances are set. They may come from a
-        file or a state dict, so a subclass checks them first. A mixture of given parameters has none."""
+        """Replace the extra tensors. Called after the weights, means and covariances are set.
+
+        The tensors may come from a file or a state dict, so a subclass checks them first and raises
+        `InvalidArgumentError`. An empty mapping is valid: a mixture of given parameters has none.
+        """
         for name in self._extra_names:
             self._buffers.pop(name, None)
             if name in tensors:

@@ -27,9 +27,11 @@ Mixture = TypeVar("Mixture", bound="Parameters | MixtureEstimator")
 
 def support_density(support: Tensor, covariances: Tensor) -> Tensor:
     """Points (K,) per m² of a component's 2σ ellipse, N/(4π√(λ₀λ₁)), in 3D; per metre, N/(4√λ₀), in 2D.
-    λ₀ ≥ λ₁ are the largest eigenvalues of the covariances (K, D, D), and support (K,) is the number of points
-    N. The 2σ ellipse of an evenly covered square has 1.05 times the area of the square, and the interval of a
-    segment 1.15 times its length. So a well-sampled surface has about its point density."""
+
+    λ₀ ≥ λ₁ are the largest eigenvalues of the covariances (K, D, D), and support (K,) is the number of
+    points N. The 2σ ellipse of an evenly covered square has 1.05 times the area of the square, and the
+    interval of a segment 1.15 times its length. So a well-sampled surface has about its point density.
+    """
     variances = torch.linalg.eigvalsh(covariances).clamp_min(torch.finfo(covariances.dtype).tiny)
     if covariances.shape[-1] == 3:
         return support / (4 * math.pi * variances[:, -1].sqrt() * variances[:, -2].sqrt())
@@ -149,8 +151,10 @@ def prune(
 
 
 def checked_origins(origins: ArrayLike, like: Tensor) -> Tensor:
-    """Sensor origins (S, D), given as (D,) or (S, D), in the dtype and on the device of `like` (…, D). Raises
-    `InvalidArgumentError` for another shape."""
+    """Sensor origins (S, D), given as (D,) or (S, D), in the dtype and on the device of `like` (…, D).
+
+    Raises `InvalidArgumentError` for another shape.
+    """
     dim = like.shape[-1]
     found = as_tensor(origins, "origins").to(like)
     if found.ndim not in (1, 2) or found.shape[-1] != dim or found.numel() == 0:

@@ -212,8 +212,11 @@ def _pair_costs(state: Gaussians, i: Tensor, j: Tensor, cost: Cost) -> Tensor:
 
 
 def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
-    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once. Each row at the place of the
-    next one is also paired with that one: the neighbour search finds only some of many equal means."""
+    """Rows i < j (P,) of means (K, D) that are near neighbours, each pair once.
+
+    If more means coincide than the neighbour search returns, it finds only some of them. Each row at the
+    place of the next one is therefore also paired with that one.
+    """
     from scipy.spatial import cKDTree
 
     k, device = means.shape[0], means.device
@@ -229,7 +232,10 @@ def _near_pairs(means: Tensor, neighbors: int) -> tuple[Tensor, Tensor]:
 
 
 def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """The pairs i, j (P,) in which each component is the other's cheapest partner, cheapest first."""
+    """The pairs i, j (P,) in which each component is the other's cheapest partner, the cheapest pair first.
+
+    No component occurs in two of these pairs, and the cheapest of all pairs is one of them.
+    """
     # Of pairs with equal costs, any order will do but that of rows, in which each blocks the next one.
     order = (((i << 32) + j) * _SPREAD).argsort()
     order = order[costs[order].argsort(stable=True)]
@@ -245,8 +251,10 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
 
 
 def parameters_of(mixture: Parameters | MixtureEstimator, name: str) -> Parameters:
-    """Parameters of a mixture or of a fitted estimator, as tensors without gradients. Raises
-    `InvalidArgumentError` for anything else, `NotFittedError` for an estimator without parameters."""
+    """Parameters of a mixture or of a fitted estimator, as tensors without gradients.
+
+    Raises `InvalidArgumentError` for anything else, `NotFittedError` for an estimator without parameters.
+    """
     check_fitted = getattr(mixture, "_fitted", None)
     if check_fitted is not None:
         check_fitted()
@@ -382,9 +390,11 @@ def merge_components(
 
 
 def merge_pairs(first: Parameters, second: Parameters) -> Parameters:
-    """Merge each component of `first` (P of them) with the component of `second` in the same row. Without
-    cancellation: with a = w₁/w and b = w₂/w, Σ = a Σ₁ + b Σ₂ + ab (μ₁ − μ₂)(μ₁ − μ₂)ᵀ. If both weights are
-    zero, both components count equally."""
+    """Merge each component of `first` (P of them) with the component of `second` in the same row.
+
+    Without cancellation: with a = w₁/w and b = w₂/w, Σ = a Σ₁ + b Σ₂ + ab (μ₁ − μ₂)(μ₁ − μ₂)ᵀ. If both
+    weights are zero, both components count equally.
+    """
     weight = first.weights + second.weights
     b = torch.where(weight > 0, second.weights / weight, 0.5)[:, None]
     offset = second.means - first.means
@@ -436,8 +446,10 @@ def kullback_leibler_bound(first: Gaussians, second: Gaussians) -> Tensor:
 
 
 def squared_hellinger(first: Gaussians, second: Gaussians) -> Tensor:
-    """H² = 1 − |Σ₁|^¼ |Σ₂|^¼ |Σ|^−½ exp(−⅛ (μ₁−μ₂)ᵀ Σ⁻¹ (μ₁−μ₂)), Σ = ½(Σ₁+Σ₂), (P,). 0 for equal Gaussians,
-    1 for Gaussians without overlap. Weights have no effect."""
+    """H² = 1 − |Σ₁|^¼ |Σ₂|^¼ |Σ|^−½ exp(−⅛ (μ₁−μ₂)ᵀ Σ⁻¹ (μ₁−μ₂)), Σ = ½(Σ₁+Σ₂), (P,).
+
+    0 for equal Gaussians, 1 for Gaussians without overlap. Weights have no effect.
+    """
     factors = safe_cholesky((first.covariances + second.covariances) / 2)
     offset = (first.means - second.means)[:, :, None]
     squared = torch.linalg.solve_triangular(factors, offset, upper=False).square().sum((1, 2))

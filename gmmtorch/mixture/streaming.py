@@ -204,7 +204,10 @@ def _stream_step(
     e_step: EStep | None,
     n_points: int,
 ) -> loop.Step[Parameters]:
-    """EM steps on the points of all processes, relative to `center` (D,)."""
+    """EM steps on the points of all processes, relative to `center` (D,).
+
+    Each process sums over its chunks, then all sum once.
+    """
 
     def centered() -> Iterator[tuple[Tensor, Tensor]]:
         # Zeros first, for a process without points.
@@ -304,7 +307,10 @@ def first_state(
 
 
 def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts:
-    """Description of the run, with the `repr` of its E-step; `tol` and `max_iter` only say when it ends."""
+    """Description of the run, with the `repr` of its E-step.
+
+    Excludes `tol` and `max_iter`, which only determine when the run ends.
+    """
     seed = mixture.random_state
     given: tuple[Any, ...] = (mixture.weights_init, mixture.means_init, mixture.precisions_init)
     if mixture._continues():

@@ -21,8 +21,10 @@ RandomState = int | np.integer | np.random.RandomState | torch.Generator | None
 
 
 def as_generator(random_state: RandomState) -> torch.Generator:
-    """A CPU generator from a seed, a NumPy RandomState, or None (random seed). A generator is returned as it
-    is."""
+    """A CPU generator from a seed, a NumPy RandomState, or None (random seed).
+
+    A generator is returned as it is.
+    """
     if isinstance(random_state, torch.Generator):
         return random_state
     generator = torch.Generator()
@@ -57,8 +59,10 @@ def warn_if_coarse(X: Array, points: Tensor) -> None:
 
 
 def checked_tensor(X: Tensor) -> Tensor:
-    """Returns points X (N, D). Raises `InvalidArgumentError` unless N, D ≥ 1 and all values are real and
-    finite."""
+    """Returns points X (N, D).
+
+    Raises `InvalidArgumentError` unless N, D ≥ 1 and all values are real and finite.
+    """
     if X.is_complex():
         raise InvalidArgumentError("X is complex; Complex data not supported.")
     X = as_tensor(X, "X")
@@ -91,8 +95,10 @@ def checked_parameter(value: Array, shape: tuple[int, ...], name: str, device: t
 
 
 def checked_mixing_weights(value: Array, n_components: int, device: torch.device) -> Tensor:
-    """`weights_init` (K,) as a float64 tensor. Raises `InvalidArgumentError` unless the weights are from 0 to
-    1 and add up to 1."""
+    """`weights_init` (K,) as a float64 tensor.
+
+    Raises `InvalidArgumentError` unless the weights are from 0 to 1 and add up to 1.
+    """
     weights = checked_parameter(value, (n_components,), "weights_init", device)
     low, high, total = float(weights.min()), float(weights.max()), float(weights.sum())
     if low < 0 or high > 1:
@@ -109,8 +115,10 @@ def checked_mixing_weights(value: Array, n_components: int, device: torch.device
 
 
 def checked_precisions(value: Array, covariance_type: str, k: int, dim: int, device: torch.device) -> Tensor:
-    """The covariances of `precisions_init`, both in the shape of the covariance type. Raises
-    `InvalidArgumentError` unless the precisions are symmetric and positive definite."""
+    """The covariances of `precisions_init`, both in the shape of the covariance type.
+
+    Raises `InvalidArgumentError` unless the precisions are symmetric and positive definite.
+    """
     name = f"{covariance_type} precision"
     try:
         precisions = checked_parameter(value, type_shape(covariance_type, k, dim), name, device)
@@ -133,8 +141,10 @@ def checked_precisions(value: Array, covariance_type: str, k: int, dim: int, dev
 
 
 def checked_weight(sample_weight: Array | None, points: Tensor) -> Tensor:
-    """Weights (N,) of the points, float64; ones if not given. Raises `InvalidArgumentError` for invalid
-    weights."""
+    """Weights (N,) of the points, float64; ones if not given.
+
+    Raises `InvalidArgumentError` for invalid weights.
+    """
     n = points.shape[0]
     if sample_weight is None:
         return points.new_ones(n)

@@ -211,8 +211,10 @@ def _joined(given: Sequence[Channel | None], sizes: Sequence[int]) -> Channel:
 
 
 def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dict[str, Tensor]:
-    """The channels (N, …) of the points of several scans together, unknown where a scan lacks one. Raises
-    `InvalidArgumentError` if a channel has different kinds or columns in the scans."""
+    """The channels (N, …) of the points of several scans together, unknown where a scan lacks one.
+
+    Raises `InvalidArgumentError` if a channel has different kinds or columns in the scans.
+    """
     check_kinds(scans)
     found = {}
     for name in dict.fromkeys(name for scan in scans for name in scan):
@@ -229,9 +231,11 @@ def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dic
 def learned(
     channels: Mapping[str, Tensor], cells: Cells, owner: Tensor, means: Tensor, covariances: Tensor
 ) -> Attributes:
-    """The attributes of K components, from the channels of points that are summed into C cells. owner (C,):
-    the component of each cell, −1 for those without one. means, covariances: of the components, in the frame
-    of the cells."""
+    """The attributes of K components, from the channels of points that are summed into C cells.
+
+    owner (C,): the component of each cell, −1 for those without one. means, covariances: of the components,
+    in the frame of the cells.
+    """
     kept = (owner >= 0).nonzero().squeeze(1)
     owner = owner[kept]
     total = _sums(owner, len(means), cells.weight[kept])
@@ -345,8 +349,10 @@ def merged(
     before: tuple[Tensor, Tensor],
     after: tuple[Tensor, Tensor],
 ) -> Attributes:
-    """The attributes of components that are merged by label (K,), whose joint moments are preserved. weights
-    (K,): supports. before, after: means and covariances, before and after the merge."""
+    """The attributes of components that are merged by label (K,), whose joint moments are preserved.
+
+    weights (K,): supports. before, after: means and covariances, before and after the merge.
+    """
     n = len(after[0])
 
     def summed(values: Tensor) -> Tensor:
@@ -392,10 +398,12 @@ _SMALL = 1e-3  # of a metre for a deviation: partners of a merge are neighbours 
 def joint_moments(
     attributes: Attributes, weights: Tensor, means: Tensor, covariances: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Means (K, F) and covariances of the positions and all numbers of K components, for choosing merges. A
-    channel is measured in its deviation in the map, which becomes a millimetre, and has a noise of a tenth of
-    it. The Kullback–Leibler divergence does not depend on units. Components without values have the moments
-    of all."""
+    """Means (K, F) and covariances of the positions and all numbers of K components, for choosing merges.
+
+    A channel is measured in its deviation in the map, which becomes a millimetre, and has a noise of a tenth
+    of it. The Kullback–Leibler divergence does not depend on units. Components without values have the
+    moments of all.
+    """
     dim = means.shape[1]
     for c in attributes.channels.values():
         if not isinstance(c, Numbers):

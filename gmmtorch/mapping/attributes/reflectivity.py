@@ -40,7 +40,9 @@ def estimated(
     """The law after more intensities (N,): a regression of their logarithms on those of range and cosine,
     with a reflectivity for each component. None: no intensity is above 0. It is robust (Tukey's biweight),
     because lidars measure next to nothing very near, and logarithms of such values are far from all others.
-    rays (N, D), white (N, D, D): as in `_view`. owner (N,): the component of each beam. law: before."""
+
+    rays (N, D), white (N, D, D): as in `_view`. owner (N,): the component of each beam. law: before.
+    """
     seen = (values > 0).nonzero().squeeze(1)  # False for NaN
     if not len(seen):
         return law

@@ -54,7 +54,8 @@ def _shortest_code(values: Ints) -> tuple[int, int, int]:
 
 
 def _rice_code(values: Ints) -> tuple[int, float]:
-    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits."""
+    """Low bits of the shortest Rice code of numbers (N,) ≥ 0, and its size in bits: a float, which does not
+    overflow."""
     n = len(values)
     if not n:
         return 0, 0.0

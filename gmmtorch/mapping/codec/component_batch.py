@@ -105,7 +105,8 @@ def _geometry(values: Quantized) -> bytes:
 
 
 def _coarse_places(values: Quantized) -> Lattice | None:
-    """The means and covariances on the coarse lattice; None unless all components are on it."""
+    """The means and covariances on the coarse lattice, perhaps with other axis orders; None unless all
+    components are on it."""
     count = values.count.numpy()
     if not len(values) or not np.array_equal(count, coarse_counts(count)):
         return None
@@ -256,8 +257,10 @@ _ROOM_FOR_SETTINGS = 48  # bytes by which settings may grow while a map is built
 
 @dataclass(frozen=True)
 class MapSettings:
-    """The settings of a map that its file contains, without the learning rule. time: of the last scan (s), in
-    a map with a half-life; None otherwise."""
+    """The settings of a map that its file contains, without the learning rule.
+
+    time: of the last scan (s), in a map with a half-life; None otherwise.
+    """
 
     resolution: float
     method: str

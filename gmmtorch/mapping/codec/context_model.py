@@ -112,7 +112,9 @@ def first_tables(coarse: bool) -> ChanceTables:
 
 class _Walk:
     """Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
-    Contexts and predictions are stated in docs/formats.md."""
+
+    Contexts and predictions are stated in docs/formats.md.
+    """
 
     def __init__(self, coder: RangeCoder, batch: CodedBatch) -> None:
         self._first = dict(zip(FIELDS, coder.first, strict=False))
@@ -326,7 +328,8 @@ class _Walk:
         own: list[float],
         off: int,
     ) -> None:
-        """Code the mean in its cell: freely along the component, across it near a plane or the sphere."""
+        """Code the mean in its cell: freely along the component; across it near the plane of component j, or
+        the sphere."""
         c, v, last, d = self.c, self.v, self.last, self.v["deviation"][i]
         side, size = math.ldexp(1, self.side), math.ldexp(1, 2 * (d[0] // 4))
         across, squares = float(self.places[j, axis[last]]), 0.0
@@ -377,7 +380,8 @@ class _Walk:
         return slopes if max(map(abs, slopes)) <= 2.0 else None
 
     def _shears(self, i: int, j: int, flag: int, given: list[float] | None) -> tuple[list[float], int]:
-        """Code the shears; returns the slopes of the last axis, and the steps to those given."""
+        """Code the shears; returns the slopes of the last axis, and how far they are from those given, in
+        steps."""
         c, last, is_round = self.c, self.last, self.is_round
         d, e, shear = self.v["deviation"][i], self.v["deviation"][j], self.v["shear"][i]
         slopes, own, turn, off = given or [0.0, 0.0], [0.0, 0.0], 0.0, 0

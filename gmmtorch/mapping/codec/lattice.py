@@ -135,9 +135,12 @@ class Lattice:
 
 def nearest(means: Tensor, covariances: Tensor, coarse: bool = False) -> Lattice:
     """The nearest lattice points of means (K, D) and covariances (K, D, D), float64 on the CPU; those of the
-    coarse lattice, if `coarse`. Covariances that are not positive definite become so. Raises
-    `InvalidArgumentError` for values beyond `FARTHEST` and `LARGEST_DEVIATION`, also if only their rounding
-    is: the result `is_valid`."""
+    coarse lattice, if `coarse`.
+
+    Covariances that are not positive definite become so. Raises `InvalidArgumentError`
+    for values beyond `FARTHEST` and `LARGEST_DEVIATION`, also if only their rounding is: the result
+    `is_valid`.
+    """
     if is_fused(means, covariances):
         found = lattice_rounding(means, covariances, _constants(means.shape[1], coarse))
         if found is not None:

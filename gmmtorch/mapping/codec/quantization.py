@@ -245,8 +245,10 @@ def ranked(rows: Ints) -> tuple[Ints, Ints]:
 
 
 def quantized_after(known: Components, rounded: Components, components: Components) -> Components:
-    """`quantized(components)`, which rounds only those after `known`, whose `rounded` values are given. If
-    the components do not begin with the known ones, all of them are rounded."""
+    """`quantized(components)`, which rounds only those after `known`, whose `rounded` values are given.
+
+    If the components do not begin with the known ones, all of them are rounded.
+    """
     if not len(components.origins):
         return components
     k, e, s = len(known), len(known.seen_by), len(known.origins)
@@ -296,7 +298,10 @@ def spatial_order(components: Components) -> Tensor:
 
 def numbered(components: Components, robot: int, first: int) -> tuple[Components, int]:
     """Components with ids for those that have none: (robot, first), (robot, first + 1), …; and the number
-    after all of them. New components come last, in their spatial order."""
+    after all of them.
+
+    New components come last, in their spatial order.
+    """
     given, *shapes = on_cpu(components.ids, components.means, components.covariances)
     new = torch.from_numpy(np.flatnonzero(given.numpy()[:, 1] < 0))
     means, covariances = shapes if len(new) == len(given) else (part[new] for part in shapes)
@@ -323,7 +328,9 @@ def quantize_numbered(components: Components, robot: int, first: int) -> Quantiz
 
 
 def _numbering(ids: Ints, by_place: Ints, robot: int, first: int) -> tuple[Ints, Ints]:
-    """Ids (K, 2) after numbering, and the order (K,): numbered components, then new ones `by_place` (J,)."""
+    """Ids (K, 2) after numbering, and the order (K,) of the components: numbered ones, then new ones in the
+    order `by_place` (J,) of these.
+    """
     is_new = ids[:, 1] < 0
     order = np.concatenate([np.flatnonzero(~is_new), np.flatnonzero(is_new)[by_place]])
     made = ids[order]

@@ -165,9 +165,12 @@ class PooledFrames(NamedTuple):
 
 
 def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> PooledFrames:
-    """The points of frames, summed into at most `max_cells` cubic cells. The cells have side `finest` (m). If
-    that gives too many cells, the side grows in steps of a third of an octave until the limit holds, which
-    must be 8 or more. Raises `InvalidArgumentError` for points that are farther away than a map stores."""
+    """The points of frames, summed into at most `max_cells` cubic cells.
+
+    The cells have side `finest` (m). If that gives too many cells, the side grows in steps of a third of an
+    octave until the limit holds, which must be 8 or more. Raises `InvalidArgumentError` for points that are
+    farther away than a map stores.
+    """
     rotation, origin = (np.stack([frame.pose.parts[i].numpy() for frame in frames]) for i in (0, 1))
     camera = np.array([frame.camera for frame in frames])
     fx, fy, cx, cy = camera.T[..., None]
@@ -208,7 +211,9 @@ def whole_frames(
     frames: Sequence[tuple[ArrayLike, ArrayLike]], broken: dict[int, GmmTorchError], *options: Any
 ) -> Iterator[DepthFrame]:
     """Frames (depth, pose) that are not broken; `options` as in `DepthFrame.of`, from the intrinsics on.
-    `broken` receives the errors of the others, by their index."""
+
+    `broken` receives the errors of the others, by their index.
+    """
     for index in range(len(frames)):
         try:
             frame = frames[index]
@@ -291,8 +296,10 @@ def fit_points(
     max_range: bool = False,
 ) -> Components:
     """Components of S clouds of points (N_s, D), each observed from its sensor origin (S, D), in metres.
+
     `attributes`: the channels of the points of each cloud. `max_range`: the points are ends of no-return
-    beams. Components are not numbered, and on the CPU."""
+    beams. Components are not numbered, and on the CPU.
+    """
     sizes = [cloud.shape[0] for cloud in clouds]
     n_points, dim = sum(sizes), origins.shape[1]
     if n_points == 0:
@@ -336,9 +343,11 @@ def fit_points(
 
 
 def fit_frames(frames: Sequence[DepthFrame], fit: SurfaceFit, viewpoints: AssignViewpoints) -> Components:
-    """Components of the points of depth images, each observed from its camera; see `fit_points`. The images
-    are summed into cells at once, without a list of their points. Components are not numbered, and on the
-    CPU."""
+    """Components of the points of depth images, each observed from its camera; see `fit_points`.
+
+    The images are summed into cells at once, without a list of their points. Components are not numbered,
+    and on the CPU.
+    """
     origins = torch.stack([frame.pose.translation for frame in frames]).detach()
     is_wide = np.ptp(origins.numpy(), 0).max() > _WIDEST * fit.noise
     if is_wide or fit.rule.needs_points or sum(frame.depth.numel() for frame in frames) <= _FEW_POINTS:
@@ -384,7 +393,9 @@ def _points_before(scan: Scan, n: int) -> Tensor:
 
 class _Window(NamedTuple):
     """points (N, D) and origins (S, D), relative to the centre of the points; scan (N,) of each point.
-    sensor: for pruning by density."""
+
+    sensor: for pruning by density.
+    """
 
     points: Tensor
     scan: Tensor

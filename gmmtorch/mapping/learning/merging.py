@@ -54,9 +54,11 @@ def all_origins(weight: float = 1.0) -> AssignViewpoints:
 
 
 def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewpoints:
-    """Keeps at most `max_origins` origins of a component, drawn by their counts without replacement. The
-    origins that are kept share the component's support, weight · N. They are real sensor origins: a centroid
-    of several would lose the free space around the sensors."""
+    """Keeps at most `max_origins` origins of a component, drawn by their counts without replacement.
+
+    The origins that are kept share the component's support, weight · N. They are real sensor origins:
+    a centroid of several would lose the free space around the sensors.
+    """
 
     def assign(counts: Tensor, weights: Tensor, n_points: float) -> AssignedViewpoints:
         support = weights * n_points
@@ -79,7 +81,9 @@ def sampled_origins(max_origins: int, generator: torch.Generator) -> AssignViewp
 
 def union_of_viewpoints(components: Components, labels: Ints) -> tuple[Ints, Ints, Floats]:
     """seen_by, seen_from, seen_count (E′,) of components merged by label (K,); counts of an origin add up.
-    Each pair of component and origin occurs once, in rising order."""
+
+    Each pair of component and origin occurs once, in rising order.
+    """
     n_origins = max(1, len(components.origins))
     given = labels[components.seen_by.numpy()] * n_origins + components.seen_from.numpy()
     keys, row = np.unique(given, return_inverse=True)
@@ -159,9 +163,11 @@ Size = Callable[[Components], int]
 
 
 def united(components: Components, found: MergedInRounds) -> Components:
-    """The components, on the CPU, after the merges that were found for them. Viewpoints are united. A
-    component that is not merged stays bit-identical. A merged component is `UNNUMBERED` and has the robot of
-    its first member."""
+    """The components, on the CPU, after the merges that were found for them. Viewpoints are united.
+
+    A component that is not merged stays bit-identical. A merged component is `UNNUMBERED` and has the robot
+    of its first member.
+    """
     first, is_merged = found.first, found.members > 1
     weights, means, covariances = found.parameters
     ids, flags = components.ids.numpy()[first.numpy()], components.max_range.numpy()[first.numpy()]

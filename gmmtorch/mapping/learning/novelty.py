@@ -95,8 +95,10 @@ def _add_beams(
 
 
 def novel_beams(components: Components, scan: Scan, rule: NoveltyRule) -> Tensor:
-    """Which beams (N,) of a scan are novel, in the order of `Scan.ends`. A beam is novel if its entropy
-    reduction reaches the threshold, or if it crosses an unobserved cell."""
+    """Which beams (N,) of a scan are novel, in the order of `Scan.ends`.
+
+    A beam is novel if its entropy reduction reaches the threshold, or if it crosses an unobserved cell.
+    """
     if len(components) == 0:
         return torch.ones(scan.n_beams, dtype=torch.bool, device=scan.points.device)
     bits, unobserved = entropy_reduction(components, scan, rule)

@@ -146,7 +146,8 @@ def _learned(
 def _explain(
     components: Components, scans: Sequence[Scan], rule: NoveltyRule, weight: float
 ) -> tuple[Components, list[Scan]]:
-    """The components with the counts of points that they explain, and the other novel beams of each scan."""
+    """The components with the counts of the points that they explain, and the novel beams of each scan
+    that no component explains."""
     remaining = []
     for scan in scans:
         novel = scan.select(novel_beams(components, scan, rule))
@@ -197,8 +198,10 @@ def cell_fit(
 
 
 def learn_part(scans: Sequence[Scan], rule: LearningRule, generator: torch.Generator) -> Components:
-    """Components of a part of an unfinished window, with which it answers until all of it is learned. Those
-    of an `IncrementalRule` are its flat pieces, at most half as many as of a window, without EM."""
+    """Components of a part of an unfinished window, with which it answers until all of it is learned.
+
+    Those of an `IncrementalRule` are its flat pieces, at most half as many as of a window, without EM.
+    """
     if isinstance(rule, WindowedRule):
         return learn_window(scans, replace(rule, iterations=1), generator)
     quick = replace(rule, window_components=max(1, rule.window_components // 2))
@@ -383,7 +386,9 @@ def _aged(
 
 def gone_log_odds(components: Components, scans: Sequence[Scan], noise: float, log_odds: Tensor) -> Tensor:
     """Log-odds (K,) after the scans that the surfaces of K components are gone; `log_odds` (K,): before them.
-    Components of no-return beams must not be among the components. noise: of the sensor, metres."""
+
+    Components of no-return beams must not be among the components. noise: of the sensor, metres.
+    """
     if len(components) == 0:
         return log_odds
     white, _ = whitening(components.covariances)
@@ -491,8 +496,10 @@ def few_points(blocks: Sequence[Block], points: Tensor, sides: Sequence[float]) 
 
 def _near(known: Components, points: Tensor, widest: float, cutoff: float) -> Tensor:
     """The viewpoint (P,) of each pair of a point and a viewpoint whose cone may give evidence to the cube.
-    First by boxes around the cones, then by balls around the components. Pairs that they leave out give next
-    to no evidence."""
+
+    First by boxes around the cones, then by balls around the components. Pairs that they leave out give
+    next to no evidence.
+    """
     extent = cutoff * known.covariances.diagonal(dim1=1, dim2=2).sqrt()
     by, origins = known.seen_by, known.origins[known.seen_from]
     low = torch.minimum((known.means - extent)[by], origins) - widest

@@ -129,8 +129,10 @@ def index_row(
 
 
 def read_index(path: Path) -> tuple[TileIndex, dict[str, Any]]:
-    """The index and its facts; `side` (m), `recent` and `n_scans` are checked, the others are not. Raises
-    `MissingDataError` if the file does not exist, and `DataError` if it is damaged."""
+    """The index and its facts; `side` (m), `recent` and `n_scans` are checked, the others are not.
+
+    Raises `MissingDataError` if the file does not exist, and `DataError` if it is damaged.
+    """
     tensors, facts = read_tensors(path, _KIND, _VERSION, _GROWN)
     low = tensors.get("low")
     dim = low.shape[1] if low is not None and low.ndim == 2 else 0
@@ -243,8 +245,10 @@ def tile_file(
 
 
 def canonical(components: Components) -> Components:
-    """The same components on the CPU in an order that depends on their values alone: by place. Ids are (0,
-    0), (0, 1), … Origins are distinct and sorted, and all used."""
+    """The same components on the CPU in an order that depends on their values alone: by place.
+
+    Ids are (0, 0), (0, 1), … Origins are distinct and sorted, and all used.
+    """
     c = components.on_cpu()
     origins, seen_from = torch.unique(c.origins[c.seen_from] + 0.0, dim=0, return_inverse=True)  # no −0
     c = replace(c, origins=origins, seen_from=seen_from)

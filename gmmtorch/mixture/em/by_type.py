@@ -41,9 +41,11 @@ Joint = Callable[..., Tensor]
 
 
 def has_linear_form(n_components: int, dim: int, kind: str) -> bool:
-    """Whether the linear form is the fastest of a covariance type: the one place of this choice. For full
-    covariances it was measured: in 50 dimensions, making the D (D + 1)/2 features of a point takes as long as
-    their products with 50 components."""
+    """Whether the linear form is the fastest of a covariance type: the one place of this choice.
+
+    For full covariances it was measured: in 50 dimensions, making the D (D + 1)/2 features of a point takes
+    as long as their products with 50 components.
+    """
     return kind != "full" or dim <= 20 or dim <= min(n_components, 50)
 
 
@@ -63,8 +65,10 @@ def expanded(parameters: Parameters, kind: str) -> Parameters:
 
 class Factors:
     """Parameters with what their log-densities need: L⁻¹ in the shape of the type, and log-constants (K,).
-    With `check`, covariances that are not positive definite raise `NumericalError`. Without it, nothing waits
-    for the device, and `failed` () tells."""
+
+    With `check`, covariances that are not positive definite raise `NumericalError`. Without it, nothing
+    waits for the device, and `failed` () tells.
+    """
 
     def __init__(self, parameters: Parameters, kind: str, check: bool = True) -> None:
         self.weights, self.means, covariances = parameters
@@ -227,9 +231,11 @@ def in_chunks(points: Tensor, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]
 
 
 class Sums:
-    """Moments of points with responsibilities, added up chunk by chunk. With `about` (K, D), second moments
-    are about these points: no digits cancel if they are near the means. Otherwise they are sums of the linear
-    form's features, about 0."""
+    """Moments of points with responsibilities, added up chunk by chunk.
+
+    With `about` (K, D), second moments are about these points: no digits cancel if they are near the
+    means. Otherwise they are sums of the linear form's features, about 0.
+    """
 
     def __init__(self, n_components: int, like: Tensor, kind: str, about: Tensor | None = None) -> None:
         k, dim = n_components, like.shape[1]
@@ -322,8 +328,10 @@ class Sums:
 
 
 def have_cancelled(second: Tensor, covariances: Tensor, kind: str, linear: bool) -> Tensor:
-    """Whether covariances, as differences of second moments, lost digits that they need, (). Those of the
-    linear form also if they are thin in a direction that is not an axis."""
+    """Whether covariances, as differences of second moments, lost digits that they need, ().
+
+    Those of the linear form also if they are thin in a direction that is not an axis.
+    """
     if kind in ("full", "tied"):
         diagonal = covariances.diagonal(dim1=-2, dim2=-1).view_as(second)
         scale = torch.maximum(second, diagonal).rsqrt().view(covariances.shape[:-1])
@@ -347,8 +355,11 @@ def expected_moments(
     about: Tensor | None = None,
     rows: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Sums, Tensor]:
-    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), (). Direct unless `linear`, with
-    second moments about the last means, or `about` (K, D). `rows`: see `rows_of_few_dimensions`."""
+    """E-step (2.3): moments of the responsibilities, and Σ_n p_n log p(x_n), ().
+
+    Direct unless `linear`, with second moments about the last means, or `about` (K, D). `rows`: see
+    `rows_of_few_dimensions`.
+    """
     if points.shape[1] <= FEW_DIMENSIONS and linear:
         rows = (em.quadratic_features(points), sample_weight) if rows is None else rows
         statistics, value = em.expectation(*rows, factors.natural(), softmax_dtype)
@@ -446,8 +457,10 @@ def em_step(
 def exact_step(
     gather: Gather, factors: Factors, reg_covar: float, previous: Parameters | None, linear: bool = False
 ) -> Moved:
-    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean. With
-    `linear`, the linear form is tried first, if that is the fastest."""
+    """`em_step` in the direct form; if a component moves far, once more with moments about its new mean.
+
+    With `linear`, the linear form is tried first, if that is the fastest.
+    """
     given = (gather, factors, reg_covar, previous)
     if linear and has_linear_form(len(factors.means), factors.dim, factors.kind):
         found = em_step(*given, linear=True)

@@ -125,9 +125,11 @@ COVARIANCE_TYPES = ("full", "tied", "diag", "spherical")
 
 
 def constrain(matrices: Tensor, covariance_type: str, weights: Tensor | None = None) -> Tensor:
-    """The nearest matrices (K, D, D) of the type; tied: their mean, weighted by `weights` (K,). The M-step of
-    a type is this projection of the full M-step, because the likelihood depends on the scatter only through
-    its product with precisions of the type."""
+    """The nearest matrices (K, D, D) of the type; tied: their mean, weighted by `weights` (K,).
+
+    The M-step of a type is this projection of the full M-step, because the likelihood depends on the scatter
+    only through its product with precisions of the type.
+    """
     if covariance_type == "full":
         return matrices
     if covariance_type == "tied":

@@ -29,8 +29,10 @@ _SURFACE_CELLS = 1 << 17  # `surface_pieces` partitions cells from twice this nu
 
 class Start(NamedTuple):
     """What a start is computed from: points (N, D), centred, float64, with weights (N,), and the settings.
-    rows: (M,) one point of each place, in an order that depends on the values only: by the first column, then
-    by a hash of the others. mass: (M,) the summed weights of the points there."""
+
+    rows: (M,) one point of each place, in an order that depends on the values only: by the first column,
+    then by a hash of the others. mass: (M,) the summed weights of the points there.
+    """
 
     points: Tensor
     weight: Tensor
@@ -157,10 +159,12 @@ def _one_of_each_piece(start: Start) -> Parameters:
 def flat_pieces(
     points: Tensor, weight: Tensor, n_components: int, reg_covar: float, features: Tensor | None = None
 ) -> tuple[Parameters, Tensor]:
-    """At most K components, and the component (N,) of each point (N, D). The cloud is halved repeatedly; long
-    and thick pieces are halved first (see `partition`). In 2D and 3D, if there are many points a component,
-    cells are partitioned instead of points. The points may already be the means of cells, with mean features
-    `features` (N, F)."""
+    """At most K components, and the component (N,) of each point (N, D).
+
+    The cloud is halved repeatedly; long and thick pieces are halved first (see `partition`). In 2D and 3D,
+    if there are many points a component, cells are partitioned instead of points. The points may already
+    be the means of cells, with mean features `features` (N, F).
+    """
     rule = FlatnessRule(
         0.0, 0.0, min_weight=0.0, min_weight_thick=0.0, max_components=n_components, outlier_gap=0.0
     )
@@ -192,8 +196,10 @@ def partition_components(
     finest: float,
     features: Tensor | None = None,
 ) -> tuple[Parameters, Tensor]:
-    """Components of the pieces that `rule` gives, and the component (N,) of each point (N, D). If there are
-    at least twice `n_cells` points (2D, 3D), cells of side `finest` or more are partitioned."""
+    """Components of the pieces that `rule` gives, and the component (N,) of each point (N, D).
+
+    If there are at least twice `n_cells` points (2D, 3D), cells of side `finest` or more are partitioned.
+    """
     dim = points.shape[1]
     exact = None
     if features is not None:
@@ -215,8 +221,11 @@ def moments_of(
     reg_covar: float,
     points: Tensor | None = None,
 ) -> Parameters:
-    """Weight, mean and covariance of the rows (N, F) of each label (N,), labels below K. Pass `points` (N, D)
-    if the features are those of points: far from the origin, points have digits that their products lack."""
+    """Weight, mean and covariance of the rows (N, F) of each label (N,), labels below K.
+
+    Pass `points` (N, D) if the features are those of points: far from the origin, points have digits that
+    their products lack.
+    """
     dim = em.feature_dimension(features.shape[1])
     if features.device.type == "cpu" and is_m_step_fused(dim, features, weight):
         rows = features if points is None else points
@@ -267,10 +276,13 @@ def initializations(
     covariance_type: str,
     n_starts: int = 1,
 ) -> Iterator[Parameters]:
-    """Starting parameters of K components for centred points with any number of distinct rows. Covariances
-    have the shape of the type. Runs of k-means on small tables are made at once. If there are fewer distinct
-    points than components, each distinct point gives one component, and the other components are copies that
-    share its weight. The density is then that of the distinct points."""
+    """Starting parameters of K components for centred points with any number of distinct rows.
+
+    Covariances have the shape of the type. Runs of k-means on small tables are made at once.
+
+    If there are fewer distinct points than components, each distinct point gives one component, and the
+    other components are copies that share its weight. The density is then that of the distinct points.
+    """
     rows, mass = distinct(points, weight)
     n = min(n_components, rows.shape[0])
     start = Start(points, weight, rows, mass, n, reg_covar, generator, covariance_type)

@@ -27,9 +27,11 @@ def kmeans(
     generator: torch.Generator,
     n_runs: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """Clusters (R, N) of points (N, D), centred, of each of R runs, and the scatter (R,) within them. Lloyd's
-    iterations from the centers of `spread_out`. A cluster that loses all its points continues at the point
-    that is farthest from its center. `rows`, `mass`: see `spread_out`."""
+    """Clusters (R, N) of points (N, D), centred, of each of R runs, and the scatter (R,) within them.
+
+    Lloyd's iterations from the centers of `spread_out`. A cluster that loses all its points continues at
+    the point that is farthest from its center. `rows`, `mass`: see `spread_out`.
+    """
     centers = points[spread_out(points, weight, rows, mass, n_clusters, generator, n_runs)]
     least = _TOLERANCE * mean_variance(points, weight)
     if is_kmeans_fused(points, weight):

@@ -174,8 +174,10 @@ def em_step(
 def _ahead(
     step: Callable[[Parameters], tuple[Parameters, Tensor]], checked: Step[Parameters], n_ahead: int
 ) -> Steps[Parameters]:
-    """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them. A step
-    whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost."""
+    """Up to `n_ahead` steps before their bounds are read: Python then waits once for all of them.
+
+    A step whose bound is NaN is taken again by `checked`. Steps beyond the last one asked for are lost.
+    """
 
     def run(parameters: Parameters, tol: float, n_most: int, last: float) -> tuple[Parameters, list[float]]:
         states, unread = [parameters], []
@@ -230,8 +232,10 @@ def blend(previous: Parameters, update: Parameters, step: float, kind: str = "fu
 
 
 def weight_of_past(seen: float | None, memory: float | None) -> float:
-    """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`. Raises
-    `InvalidArgumentError` for an invalid memory, or memory=None if `seen` is unknown."""
+    """Number of points that the current mixture counts as: `seen` (None: unknown), at most `memory`.
+
+    Raises `InvalidArgumentError` for an invalid memory, or memory=None if `seen` is unknown.
+    """
     if memory is None:
         if seen is None:
             raise InvalidArgumentError(

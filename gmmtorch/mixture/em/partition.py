@@ -142,7 +142,9 @@ def partition(
 
 
 def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | None) -> Tensor:
-    """The pieces of highest priority among those to halve; once there are many, half of all at most."""
+    """The pieces of highest priority among those to halve, within the limit, and half of all once there
+    are many.
+    """
     if limit is None:
         return cut
     order = torch.where(cut, priority, -torch.inf).argsort(descending=True, stable=True)
@@ -157,9 +159,11 @@ def _is_supported(
     along: Tensor, labels: Tensor, weight: Tensor, n_pieces: int, least: Tensor, outlier_gap: float
 ) -> Tensor:
     """Whether a cut at 0 of the positions (N,) along each piece's axis leaves enough points, (n_pieces,).
+
     Both halves must weigh `least` (n_pieces,). A smaller half is also allowed if it is an outlier: farther
     than `outlier_gap` (m), and farther than six standard deviations of the larger half. Otherwise a few stray
-    returns would prevent the partition of their whole piece."""
+    returns would prevent the partition of their whole piece.
+    """
     side = labels * 2 + (along > 0)
     if not bool(least.any()):
         return torch.bincount(side, minlength=2 * n_pieces).view(n_pieces, 2).amin(1) > 0

@@ -61,8 +61,10 @@ class Settings:
 
 
 class Momentum:
-    """M-steps on the statistics of the E-step plus a share of their last change (Nesterov's schedule). A
-    component takes EM's own step instead if that reduces its mass or its smallest thickness too much."""
+    """M-steps on the statistics of the E-step plus a share of their last change (Nesterov's schedule).
+
+    A component takes EM's own step instead if that reduces its mass or its smallest thickness too much.
+    """
 
     def __init__(self, reg_covar: float) -> None:
         self._reg_covar = reg_covar
@@ -188,8 +190,10 @@ def _candidate_sets(
 
 
 def _with_enough_digits(rows: Rows, groups: Groups, means: Tensor, own: Tensor) -> Groups:
-    """The same groups, in float64 and relative to the current means if float32 has too few digits. This is
-    checked at each step, because components become thinner and move away from their group's center."""
+    """The same groups, in float64 and relative to the current means if float32 has too few digits.
+
+    This is checked at each step, because components become thinner and move away from their group's center.
+    """
     if groups.features.dtype == torch.float64:
         return groups
     average, worst = rounding(groups, own)
@@ -201,9 +205,11 @@ def _with_enough_digits(rows: Rows, groups: Groups, means: Tensor, own: Tensor) 
 def fit_truncated(
     rows: Rows, owner: Tensor, parameters: Parameters, settings: Settings
 ) -> EMResult[Parameters]:
-    """`run_truncated`, first on a random sample if there are many points, or on cells if very many. With the
-    same owners and candidates, the bound on cells is below the bound on their points, so the bounds still
-    never decrease. Bounds on a sample do not bound the whole cloud and are left out."""
+    """`run_truncated`, first on a random sample if there are many points, or on cells if very many.
+
+    With the same owners and candidates, the bound on cells is below the bound on their points, so the
+    bounds still never decrease. Bounds on a sample do not bound the whole cloud and are left out.
+    """
     n, n_components = rows.weight.shape[0], parameters.weights.shape[0]
     shared = settings.processes.size > 1  # then all processes decide equally
     n_all = int(settings.processes.sum(rows.weight.new_tensor([n]))) if shared else n
@@ -286,8 +292,10 @@ class Groups(NamedTuple):
 def group_rows(
     rows: Rows, owner: Tensor, centers: Tensor, dtype: torch.dtype, as_points: bool = False
 ) -> Groups:
-    """Group rows by owner (N,), relative to the owner's center (K, D), in `dtype`. With `as_points`, for
-    points: the groups have points (b, B, D) in place of their features."""
+    """Group rows by owner (N,), relative to the owner's center (K, D), in `dtype`.
+
+    With `as_points`, for points: the groups have points (b, B, D) in place of their features.
+    """
     n, (k, dim) = owner.shape[0], centers.shape
     # Small blocks need little padding; large blocks multiply faster.
     block = 16 if n < 48 * k else 32 if n < 200 * k else 64
@@ -337,8 +345,10 @@ def nearest(points: Tensor, means: Tensor) -> Tensor:
 
 
 def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int) -> Tensor:
-    """The `n_candidates` most likely components (K, m) for the group of each of the K owners. A sample of
-    each group's rows is compared with all components. The owner is always a candidate."""
+    """The `n_candidates` most likely components (K, m) for the group of each of the K owners.
+
+    A sample of each group's rows is compared with all components. The owner is always a candidate.
+    """
     k = parameters.weights.shape[0]
     if k <= n_candidates:
         return torch.arange(k, device=groups.owner.device).expand(k, k)
@@ -373,10 +383,12 @@ def truncated_expectation(
     want_owner: bool = False,
     own: Tensor | None = None,
 ) -> tuple[Tensor, float, Tensor | None]:
-    """E-step of `exact.expectation`, restricted to the candidates (G, m) of each of the G groups. Returns the
-    statistics (K, F) relative to the components' means, float64; Σ p log Σ_candidates, nats; and with
-    `want_owner` the most likely candidate (N,) of each row. `own`: the `centered_parameters`, if they are
-    known."""
+    """E-step of `exact.expectation`, restricted to the candidates (G, m) of each of the G groups.
+
+    Returns the statistics (K, F) relative to the components' means, float64; Σ p log Σ_candidates, nats; and
+    with `want_owner` the most likely candidate (N,) of each row. `own`: the `centered_parameters`, if they
+    are known.
+    """
     own = centered_parameters(parameters) if own is None else own
     n_groups, m = candidates.shape
     n_blocks, block, n_features = groups.features.shape
@@ -412,8 +424,10 @@ def centered_parameters(parameters: Parameters) -> Tensor:
 
 
 def _local_parameters(own: Tensor, means: Tensor, centers: Tensor, candidates: Tensor) -> Tensor:
-    """Natural parameters (K, m, F) of the candidates (K, m), relative to each group's center (K, D). own
-    (K, F): natural parameters of the components about their own means (K, D)."""
+    """Natural parameters (K, m, F) of the candidates (K, m), relative to each group's center (K, D).
+
+    own (K, F): natural parameters of the components about their own means (K, D).
+    """
     dim = centers.shape[1]
     doubled = own[:, 1 + dim :]
     scale = pack_symmetric(0.5 + 0.5 * torch.eye(dim, dtype=own.dtype, device=own.device))
@@ -446,9 +460,11 @@ def _likeliest(natural: Tensor, features: Tensor) -> Tensor:
 
 
 def rounding(groups: Groups, own: Tensor) -> tuple[float, float]:
-    """Expected error of a float32 E-step, nats a point: the mean, and that of the worst group. The error is
-    ε/2 E[‖x‖²] tr Σ⁻¹. It is also the relative error of a component's smallest variance. `own` (K, F): the
-    `centered_parameters`."""
+    """Expected error of a float32 E-step, nats a point: the mean, and that of the worst group.
+
+    The error is ε/2 E[‖x‖²] tr Σ⁻¹. It is also the relative error of a component's smallest variance. `own`
+    (K, F): the `centered_parameters`.
+    """
     diagonal = pack_symmetric(torch.eye(groups.centers.shape[1], dtype=own.dtype, device=own.device))
     precision = -2 * (own[:, -diagonal.shape[0] :] @ diagonal)
     error = groups.spread * precision * (torch.finfo(torch.float32).eps / 2)

@@ -54,8 +54,10 @@ class Posterior(NamedTuple):
 def unbiased_covariance(
     points: Tensor, weight: Tensor, thickness: float, covariance_type: str = "full"
 ) -> Tensor:
-    """Covariance (D, D), of the type, of points whose mean is the origin. In directions in which the points
-    are flat, the variance is `thickness` (m²) instead of zero."""
+    """Covariance (D, D), of the type, of points whose mean is the origin.
+
+    In directions in which the points are flat, the variance is `thickness` (m²) instead of zero.
+    """
     total = float(weight.sum())
     # No unbiased estimate exists below two points; W/2 continues W − 1 continuously.
     count = max(total - 1, total / 2)
@@ -135,7 +137,9 @@ def expected_log_weights(concentration: Tensor) -> Tensor:
 
 def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
     """ω (K,) and Gaussians such that E[log π_k + log N(x | μ_k, Λ_k⁻¹)] = ω_k + log N(x | m_k, Σ_k).
-    Σ = E[Λ]⁻¹, and ω is E[log π] + ½(E[log|Λ|] − log|E[Λ]|) − D/2β. Bishop (10.64)–(10.66)."""
+
+    Σ = E[Λ]⁻¹, and ω is E[log π] + ½(E[log|Λ|] − log|E[Λ]|) − D/2β. Bishop (10.64)–(10.66).
+    """
     dim = posterior.means.shape[1]
     dof = posterior.degrees_of_freedom
     steps = torch.arange(dim, dtype=dof.dtype, device=dof.device)
@@ -149,7 +153,9 @@ def expected_log_density(posterior: Posterior) -> tuple[Tensor, Parameters]:
 
 def assigned_log_density(moments: Parameters, log_weight: Tensor, factors: by_type.Factors) -> Tensor:
     """Σ_n Σ_k γ_nk (ω_k + log N(x_n | m_k, Σ_k)), a scalar, of points with moments (N_k, x̄_k, S_k).
-    Covariances have the shape of their type. factors: of weights 1, m and Σ."""
+
+    Covariances have the shape of their type. factors: of weights 1, m and Σ.
+    """
     count, mean, covariance = moments
     whiten, offset = factors.whiten, mean - factors.means
     if factors.kind in ("full", "tied"):
@@ -198,8 +204,10 @@ def _log_det(covariances: Tensor, kind: str, dim: int) -> Tensor:
 
 
 def log_predictive(points: Tensor, posterior: Posterior, covariance_type: str = "full") -> Tensor:
-    """log p(x | X) (N,) of new points (N, D): Σ_k E[π_k] Student-t(x | m_k, L_k⁻¹, ν_k + 1 − D). The scale
-    L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82)."""
+    """log p(x | X) (N,) of new points (N, D): Σ_k E[π_k] Student-t(x | m_k, L_k⁻¹, ν_k + 1 − D).
+
+    The scale L_k⁻¹ is W_k⁻¹ (1 + β_k) / (β_k (ν_k + 1 − D)). Bishop (10.81)–(10.82).
+    """
     k, dim = posterior.means.shape
     dof = posterior.degrees_of_freedom + 1 - dim
     ratio = posterior.degrees_of_freedom / dof * (1 + 1 / posterior.mean_precision)
@@ -227,9 +235,11 @@ def variational_step(
     softmax_dtype: torch.dtype,
     covariance_type: str = "full",
 ) -> loop.Step[Posterior]:
-    """One iteration for `loop.run_em`: responsibilities given a posterior, and their posterior. The bound
-    (nats per point) is that of the returned posterior. Covariances of the points of a component include
-    `reg_covar` (m²)."""
+    """One iteration for `loop.run_em`: responsibilities given a posterior, and their posterior.
+
+    The bound (nats per point) is that of the returned posterior. Covariances of the points of a component
+    include `reg_covar` (m²).
+    """
     rows = by_type.rows_of_few_dimensions(points, sample_weight)
     total = float(sample_weight.sum())
     kind = covariance_type

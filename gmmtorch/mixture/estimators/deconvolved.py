@@ -136,8 +136,10 @@ class DeconvolvedGaussianMixture(MixtureEstimator):
 
 
 def checked_noise(noise: Array | None, n: int, points: Tensor) -> Tensor:
-    """Noise covariances (D, D) or (N, D, D), float64, on the device of `points`; zero if None. Raises
-    `InvalidArgumentError` unless they are finite, symmetric and positive semi-definite."""
+    """Noise covariances (D, D) or (N, D, D), float64, on the device of `points`; zero if None.
+
+    Raises `InvalidArgumentError` unless they are finite, symmetric and positive semi-definite.
+    """
     dim = points.shape[1]
     if noise is None:
         return points.new_zeros(dim, dim)
@@ -359,8 +361,10 @@ def pair_chunks(points: Tensor, noise: Tensor, parameters: Parameters) -> Iterat
 
 def _log_bounds(noise: Tensor, parameters: Parameters) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
     """A function that bounds log π_k + log N(x | μ_k, Σ_k + R) (n, K) from below and above, for any of the R.
-    Because low I ≼ R ≼ high I, the determinant and the quadratic form of Σ + R are between those of Σ + low I
-    and Σ + high I. So two plain mixtures, which are fast to evaluate, bound every log-density."""
+
+    Because low I ≼ R ≼ high I, the determinant and the quadratic form of Σ + R are between those of
+    Σ + low I and Σ + high I. So two plain mixtures, which are fast to evaluate, bound every log-density.
+    """
     spread = torch.linalg.eigvalsh(noise)
     low, high = spread[:, 0].amin().clamp_min(0), spread[:, -1].amax()
     eye = torch.eye(noise.shape[-1], dtype=noise.dtype, device=noise.device)

@@ -120,9 +120,11 @@ def fit_depth_image(
 
 
 def _block_features(depth: Tensor, intrinsics: Tensor, max_range: float) -> tuple[Tensor, Tensor]:
-    """Sums of features over blocks of pixels: of the points, and of (u, v, 1/z), (10, h, w) each. u and v are
-    in pixels: relative to the optical axis for the points, and to the middle of the largest cell for (u, v,
-    1/z). h and w are rounded up to whole largest cells."""
+    """Sums of features over blocks of pixels: of the points, and of (u, v, 1/z), (10, h, w) each.
+
+    u and v are in pixels: relative to the optical axis for the points, and to the middle of the largest
+    cell for (u, v, 1/z). h and w are rounded up to whole largest cells.
+    """
     side = _BLOCK << _LEVELS
     padded = torch.nn.functional.pad(depth, (0, -depth.shape[1] % side, 0, -depth.shape[0] % side))
     valid = (padded > 0) & (padded < min(max_range, _FARTHEST))  # False for NaN
@@ -144,10 +146,12 @@ def _block_features(depth: Tensor, intrinsics: Tensor, max_range: float) -> tupl
 
 
 def _block_sums(valid: Tensor, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-    """Σ1, (Σz, Σz²) and (Σw, Σw²), w = 1/z, over the valid pixels of blocks of an image (H, W). Each is
-    multiplied by 1, d, e, d², de, e², with d and e in pixels from the middle of the block: (6, h, w),
-    float64. Pixels are summed in float32 relative to a value of the block (0 if none is valid), so that thin
-    and distant cells keep their digits."""
+    """Σ1, (Σz, Σz²) and (Σw, Σw²), w = 1/z, over the valid pixels of blocks of an image (H, W).
+
+    Each is multiplied by 1, d, e, d², de, e², with d and e in pixels from the middle of the block: (6, h, w),
+    float64. Pixels are summed in float32 relative to a value of the block (0 if none is valid), so that
+    thin and distant cells keep their digits.
+    """
     images = torch.empty(5, *z.shape, dtype=torch.float32, device=z.device)
     images[0] = valid
     middles, missing = [], ~valid
@@ -193,9 +197,11 @@ def _about(sums: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, ...]:
 
 
 def _is_flat(sums: Tensor, deviation: float) -> Tensor:
-    """Whether depth deviates from a plane by at most `deviation` (m, times z² beyond one metre), (h, w). Uses
-    the variance of inverse depth w given u and v. On a plane w is linear in u and v, and a deviation of w is
-    that of depth divided by z²."""
+    """Whether depth deviates from a plane by at most `deviation` (m, times z² beyond one metre), (h, w).
+
+    Uses the variance of inverse depth w given u and v. On a plane w is linear in u and v, and a deviation
+    of w is that of depth divided by z².
+    """
     u, v, w, uu, uv, uw, vv, vw, ww = sums[1:] / sums[0].clamp_min(1)
     # The added variance keeps the slope of pixels in one line finite.
     suu, suv, svv = uu - u * u + _LEAST_VARIANCE, uv - u * v, vv - v * v + _LEAST_VARIANCE

@@ -177,8 +177,10 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Iterate:
-    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2). Each row
-    of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η."""
+    """A point of the manifold, with f and its gradient. Tangent vectors are (K, 1 + (D+1)(D+2)/2).
+
+    Each row of a tangent vector has the entries of Ξ, as in `pack_tangent`, and the change of η.
+    """
 
     likelihood: Likelihood
     frames: Frames
@@ -189,8 +191,10 @@ class Iterate:
     inverse_hessian: Tensor
 
     def bounded(self, direction: Tensor) -> Tensor:
-        """The direction with a limited norm in each component. Outdated curvature can give an arbitrarily
-        long step to a component that loses its points."""
+        """The direction with a limited norm in each component.
+
+        Outdated curvature can give an arbitrarily long step to a component that loses its points.
+        """
         return direction / (direction.norm(dim=1, keepdim=True) / _LONGEST_STEP).clamp_min(1)
 
     def move(self, tangent: Tensor) -> Iterate:
@@ -258,8 +262,10 @@ def ascend(
     point: Iterate, *, tol: float, max_iter: int, on_iteration: OnIteration | None = None
 ) -> tuple[Iterate, list[float], bool]:
     """Climb from a point. Returns the final point, the value after each iteration, and whether it converged.
+
     Converged: an iteration gained less than `tol`, and a step by the first guess of the Hessian would also
-    gain less, to second order; or no higher point was found, to rounding. Values never decrease."""
+    gain less, to second order; or no higher point was found, to rounding. Values never decrease.
+    """
     memory, values = Memory(maxlen=_MEMORY), list[float]()
     for iteration in range(max_iter):
         found = _climb(point, memory)
@@ -292,8 +298,10 @@ def _climb(point: Iterate, memory: Memory) -> Iterate:
 
 def search(point: Iterate, direction: Tensor) -> tuple[float, Iterate]:
     """Step length along a direction, and the point there; 0 and `point` if the direction does not ascend.
-    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the weak
-    Wolfe conditions hold (Nocedal & Wright, 3.6)."""
+
+    Steps that gain too little are halved, and steps that leave too steep a slope are doubled, until the
+    weak Wolfe conditions hold (Nocedal & Wright, 3.6).
+    """
     slope = _dot(point.gradient, direction)
     best = (0.0, point)
     if not slope > 1e-16 * abs(point.value):

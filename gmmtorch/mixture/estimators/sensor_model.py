@@ -177,8 +177,10 @@ class LaserModel(SensorModel):
 
 
 def beams(points: Tensor, origin: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit vectors (N, D) from the origin (D,) or (N, D) to the points, and their distances (N,). A point at
-    the origin has no direction; it gets the first axis."""
+    """Unit vectors (N, D) from the origin (D,) or (N, D) to the points, and their distances (N,).
+
+    A point at the origin has no direction; it gets the first axis.
+    """
     offset = points - origin
     distance = offset.norm(dim=1)
     beam = offset / distance.clamp_min(1e-300)[:, None]

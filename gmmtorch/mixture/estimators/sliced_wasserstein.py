@@ -128,9 +128,11 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
 
 
 class Shape(nn.Module):
-    """A mixture as unconstrained parameters, zero at the start except the logits. Weights are a softmax.
-    Means move by multiples of K^(−1/D), the size of a component in a cloud of spread 1. Covariances are L T
-    Tᵀ Lᵀ, with L of the start and T triangular with exp on its diagonal."""
+    """A mixture as unconstrained parameters, zero at the start except the logits.
+
+    Weights are a softmax. Means move by multiples of K^(−1/D), the size of a component in a cloud of
+    spread 1. Covariances are L T Tᵀ Lᵀ, with L of the start and T triangular with exp on its diagonal.
+    """
 
     def __init__(self, first: Parameters) -> None:
         super().__init__()
@@ -160,8 +162,10 @@ def descend(
     dtype: torch.dtype = torch.float64,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> tuple[list[float], bool]:
-    """Adam on the mean W₂² along the slices: its value in each pass, and whether it converged. The learning
-    rate is halved after a pass that decreases the value by less than a share `tol`."""
+    """Adam on the mean W₂² along the slices: its value in each pass, and whether it converged.
+
+    The learning rate is halved after a pass that decreases the value by less than a share `tol`.
+    """
     adam = torch.optim.Adam(shape.parameters(), lr=learning_rate, betas=_MOMENTS)
     n = slices.directions.shape[0]
     rounds = math.ceil(_STEPS / math.ceil(n / _BATCH))
@@ -189,8 +193,10 @@ def descend(
 
 
 def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float64) -> float:
-    """Mean W₂² along the slices. Its derivatives by the parameters of the shape are stored in their
-    `grad`."""
+    """Mean W₂² along the slices.
+
+    Its derivatives by the parameters of the shape are stored in their `grad`.
+    """
     n = slices.directions.shape[0]
     with torch.enable_grad():
         weights, means, covariances = shape()
@@ -208,8 +214,11 @@ def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float
 
 
 class Slices(NamedTuple):
-    """A cloud along P directions, summarised at J levels. directions: unit vectors (P, D). values: u (P, J),
-    each the mean of the coordinates between two levels. levels: t_1 … t_{J−1} (J − 1,). power: E[u²] (P,)."""
+    """A cloud along P directions, summarised at J levels.
+
+    directions: unit vectors (P, D). values: u (P, J), each the mean of the coordinates between two
+    levels. levels: t_1 … t_{J−1} (J − 1,). power: E[u²] (P,).
+    """
 
     directions: Tensor
     values: Tensor
@@ -230,8 +239,10 @@ def random_directions(n: int, dim: int, generator: torch.Generator) -> Tensor:
 
 
 def slice_cloud(points: Tensor, weight: Tensor, directions: Tensor) -> Slices:
-    """Points (N, D) with weights (N,) along directions (P, D). Levels are denser near 0 and 1, where
-    coordinates spread more: t_j = (1 − cos(πj/J)) / 2."""
+    """Points (N, D) with weights (N,) along directions (P, D).
+
+    Levels are denser near 0 and 1, where coordinates spread more: t_j = (1 − cos(πj/J)) / 2.
+    """
     step = torch.arange(LEVELS + 1, dtype=points.dtype, device=points.device)
     levels = 0.5 * (1 - torch.cos(math.pi / LEVELS * step))
     values = []
@@ -260,8 +271,10 @@ def interpolate(x: Tensor, knots: Tensor, heights: Tensor) -> Tensor:
 
 def mixture_quantiles(levels: Tensor, weights: Tensor, means: Tensor, deviations: Tensor) -> Tensor:
     """Approximate quantiles (P, M) at levels (M,) of 1-D mixtures: means, deviations (P, K), weights (K,).
-    Newton's method within brackets on Φ⁻¹(F(a)) = Φ⁻¹(t), which is linear for one component. The start is a
-    mixture of a few points in each component."""
+
+    Newton's method within brackets on Φ⁻¹(F(a)) = Φ⁻¹(t), which is linear for one component. The start is
+    a mixture of a few points in each component.
+    """
     n = means.shape[0]
     nodes = means.new_tensor(_NODES)
     first = (means[:, :, None] + deviations[:, :, None] * nodes).flatten(1).sort(1)
@@ -296,8 +309,10 @@ def transport(
     slices: Slices, weights: Tensor, means: Tensor, deviations: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Transport from 1-D mixtures, means and deviations (P, K), weights (K,), to the slices of a cloud.
+
     Returns W₂² (P,) along each direction, and its derivatives by w, m and s, each (P, K). Computed in the
-    dtype of the mixtures, in chunks of directions."""
+    dtype of the mixtures, in chunks of directions.
+    """
     rows = max(1, _BLOCK_ELEMENTS // (LEVELS * weights.shape[0]))
     if means.shape[0] > rows:
         chunks = (slice(begin, begin + rows) for begin in range(0, means.shape[0], rows))

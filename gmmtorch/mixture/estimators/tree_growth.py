@@ -36,9 +36,12 @@ _ROUNDINGS = 10.0  # variances below this number of roundings of squared distanc
 
 
 class Tree(NamedTuple):
-    """Nodes of a tree of Gaussians, level by level, parents before children. The root, which is the whole
-    cloud, is not a node. parents: (M,) the parent of each node, −1 on the first level. weights: (M,) share of
-    the cloud; the children of a node have its weight in total. means: (M, D). covariances: (M, D, D)."""
+    """Nodes of a tree of Gaussians, level by level, parents before children.
+
+    The root, which is the whole cloud, is not a node. parents: (M,) the parent of each node, −1 on the
+    first level. weights: (M,) share of the cloud; the children of a node have its weight in total. means:
+    (M, D). covariances: (M, D, D).
+    """
 
     parents: Tensor
     weights: Tensor
@@ -185,9 +188,11 @@ def _split(
     on_values: Callable[[Tensor], None],
     density: DensityLimit | None,
 ) -> tuple[Children, Assignment, Tensor, bool]:
-    """At most m children in each node; the nodes' members assigned to them; whether EM converged. Third, what
-    the splits gain (G,), nats, before pruning by density: points that fit no surface would otherwise prevent
-    splits."""
+    """At most m children in each node; the nodes' members assigned to them; whether EM converged.
+
+    Third, what the splits gain (G,), nats, before pruning by density: points that fit no surface would
+    otherwise prevent splits.
+    """
     centers, mass = nodes.parameters.means, members.mass(nodes.n)
     packed, children, converged = fit_children(points, members, centers, m, rule, on_values)
     children = keep_children(children, children.weights * mass[:, None] >= rule.min_support)
@@ -215,8 +220,10 @@ def _accepted_splits(children: Children, gain: Tensor, mass: Tensor, free: float
 def _build_children(
     children: Children, assignment: Assignment, nodes: Nodes, accepted: Tensor, weight: Tensor, n_before: int
 ) -> tuple[Nodes, Members, Tree]:
-    """The children of the accepted nodes, their members, and the new level of the tree. weight: (N,) of the
-    points. n_before: number of nodes in earlier levels."""
+    """The children of the accepted nodes, their members, and the new level of the tree.
+
+    weight: (N,) of the points. n_before: number of nodes in earlier levels.
+    """
     (members, log_density, _), m = assignment, children.weights.shape[1]
     chosen = ((children.weights > 0) & accepted[:, None]).flatten().nonzero().squeeze(1)
     parents = nodes.parameters
@@ -262,10 +269,12 @@ class Members(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """Members in blocks of B of one node. Members of weight 0 fill incomplete blocks. values: (b, F, B)
-    features relative to the node's centre; the points (b, D, B) if their features would need much memory.
-    weight: (b, B). node: (b,) of each block. member: (b, B) index of the member in each place, −1 if the
-    place is empty. dim: D."""
+    """Members in blocks of B of one node. Members of weight 0 fill incomplete blocks.
+
+    values: (b, F, B) features relative to the node's centre; the points (b, D, B) if their features
+    would need much memory. weight: (b, B). node: (b,) of each block. member: (b, B) index of the
+    member in each place, −1 if the place is empty. dim: D.
+    """
 
     values: Tensor
     weight: Tensor
@@ -307,8 +316,11 @@ def pack(points: Tensor, members: Members, centers: Tensor, dtype: torch.dtype) 
 
 
 class Children(NamedTuple):
-    """Mixtures of m children in each of G nodes; weights add up to one in each node. weights: (G, m), 0 for
-    an absent child. means: (G, m, D) relative to the node's centre. covariances: (G, m, D, D)."""
+    """Mixtures of m children in each of G nodes; weights add up to one in each node.
+
+    weights: (G, m), 0 for an absent child. means: (G, m, D) relative to the node's centre. covariances:
+    (G, m, D, D).
+    """
 
     weights: Tensor
     means: Tensor
@@ -370,10 +382,12 @@ def maximization(
 
 
 def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_covar: float) -> Children:
-    """Start of EM: each node's members are cut into at most m pieces, with one component per piece. Pieces
-    are halved at their mean across their longest direction, those with the largest scatter first, while they
-    are longer than `reg_covar` (m²) resolves. The result is deterministic and does not depend on the frame. A
-    node with fewer distinct places than m gets children of weight 0."""
+    """Start of EM: each node's members are cut into at most m pieces, with one component per piece.
+
+    Pieces are halved at their mean across their longest direction, those with the largest scatter first,
+    while they are longer than `reg_covar` (m²) resolves. The result is deterministic and does not depend
+    on the frame. A node with fewer distinct places than m gets children of weight 0.
+    """
     label = torch.zeros_like(packed.member)
     n_pieces = 1
     dtype, dim = packed.values.dtype, packed.dim
@@ -414,8 +428,10 @@ def fit_children(
     points: Tensor, members: Members, centers: Tensor, m: int, rule: Rule, on_values: Callable[[Tensor], None]
 ) -> tuple[Packed, Children, bool]:
     """EM of m children in each node until its mean log-likelihood increases by less than `rule.tol` nats.
+
     Returns the packed members, the children, and whether EM converged in all nodes. If the error of float32
-    becomes too large, EM goes on in float64. `on_values` gets Σ p log Σ_children (G,) before each M-step."""
+    becomes too large, EM goes on in float64. `on_values` gets Σ p log Σ_children (G,) before each M-step.
+    """
     mass, dtype, left = members.mass(len(centers)), SOFTMAX_DTYPES[rule.dtype], rule.max_iter
     children: Children | None = None
     while True:
@@ -446,8 +462,10 @@ def fit_children(
 
 
 def keep_children(children: Children, kept: Tensor) -> Children:
-    """Set children outside of the mask (G, m) to weight 0, in favour of their siblings. A node without a
-    child in the mask keeps its largest one."""
+    """Set children outside of the mask (G, m) to weight 0, in favour of their siblings.
+
+    A node without a child in the mask keeps its largest one.
+    """
     kept = kept & (children.weights > 0)
     largest = children.weights == children.weights.amax(1, keepdim=True)
     weights = torch.where(torch.where(kept.any(1, keepdim=True), kept, largest), children.weights, 0.0)
@@ -463,8 +481,11 @@ Assignment = tuple[Members, Tensor, Tensor]
 
 
 def assign_members(packed: Packed, children: Children, members: Members, soft_threshold: float) -> Assignment:
-    """Assign the members of each node to its children (2.7): to each child j with γ_j > λ max γ. The most
-    likely child is always included. The children share the member's whole weight in proportion to γ (2.8)."""
+    """Assign the members of each node to its children (2.7): to each child j with γ_j > λ max γ.
+
+    The most likely child is always included. The children share the member's whole weight in proportion
+    to γ (2.8).
+    """
     m = children.weights.shape[1]
     natural = children.natural(packed.values.dtype)
     log_weight = children.weights.log().flatten()
