@@ -150,7 +150,8 @@ class _Revision:
             self.poses = optimised(poses, self.edges, with_covariances=False).poses
 
     def _join(self, groups: Sequence[Sequence[int]]) -> bool:
-        """Moves the last group into the map of the first one's last scans, if that is sure; whether it is."""
+        """Moves the last group to where its first scans lie in the map of the first group's last ones, if
+        that is sure; returns whether it is."""
         old, new = groups[0][-2 * _NEIGHBOURS - 1 :], groups[-1][:_TOGETHER]
         if min(len(old), len(new)) < _FEWEST:
             return False

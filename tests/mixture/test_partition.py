@@ -15,12 +15,12 @@ from torch import Tensor
 from gmmtorch.kernels import kernels
 from gmmtorch.mixture import GaussianMixture
 from gmmtorch.mixture.em.exact import quadratic_features
-from gmmtorch.mixture.em.partition import FlatnessRule, partition, pool_into_cells
+from gmmtorch.mixture.em.partition import FlatnessRule, Partition, partition, pool_into_cells
 
 RULE = FlatnessRule(thickness=0.02, length=0.5, min_weight=5)
 
 
-def cut(points: Tensor, rule: FlatnessRule, weight: Tensor | None = None) -> tuple[Tensor, int]:
+def cut(points: Tensor, rule: FlatnessRule, weight: Tensor | None = None) -> Partition:
     return partition(points, points.new_ones(len(points)) if weight is None else weight, rule)
 
 
@@ -69,13 +69,13 @@ def test_integer_weights_equal_repeated_points():
     center = repeated.mean(0)
     labels, n_pieces = cut(points - center, RULE, weight)
     again = cut(repeated - center, RULE)
-    assert n_pieces == again[1]
-    assert torch.equal(labels.repeat_interleave(weight.long()), again[0])
+    assert n_pieces == again.n_pieces
+    assert torch.equal(labels.repeat_interleave(weight.long()), again.labels)
 
 
 @pytest.mark.parametrize("n", [1, 2, 100])
 def test_equal_points_are_one_piece(n):
-    assert cut(torch.zeros(n, 3, dtype=torch.float64), RULE)[1] == 1
+    assert cut(torch.zeros(n, 3, dtype=torch.float64), RULE).n_pieces == 1
 
 
 @pytest.mark.parametrize(("n_strays", "distance"), [(9, 200.0), (9, 1000.0), (1, 500.0)])
@@ -86,9 +86,9 @@ def test_few_far_returns_do_not_prevent_the_partition(n_strays, distance, genera
     separate = partition(room, torch.ones(len(room), dtype=torch.float64), rule)
     points = torch.cat([room, strays])
     both = partition(points - points.mean(0), torch.ones(len(points), dtype=torch.float64), rule)
-    assert both[1] >= separate[1]
-    of_strays = both[0][len(room) :]
-    assert not torch.isin(both[0][: len(room)], of_strays).any()
+    assert both.n_pieces >= separate.n_pieces
+    of_strays = both.labels[len(room) :]
+    assert not torch.isin(both.labels[: len(room)], of_strays).any()
 
 
 # -- a limited number of pieces ----------------------------------------------------------------------
@@ -159,7 +159,7 @@ def test_pieces_that_cannot_be_halved_do_not_use_up_the_levels():
     features[:90, 3] += 100.0
     features[:90, 5] += 100.0
     found = partition(points - center, weight, FlatnessRule(**ALL, max_components=125), features)
-    assert found[1] == 125
+    assert found.n_pieces == 125
 
 
 @given(

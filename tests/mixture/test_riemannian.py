@@ -93,7 +93,7 @@ def test_em_does_not_improve_the_result(init_params, reg_covar):
     assert 0 <= again.lower_bounds[-1] - again.lower_bounds[0] < 1e-7
     place = Likelihood(torch.from_numpy(points), torch.ones(len(points)).double(), reg_covar).at(parameters)
     assert float(place.gradient.norm()) < 1e-4
-    torch.testing.assert_close(place.frames[2].norm(dim=1), torch.ones(4).double(), rtol=0, atol=1e-3)
+    torch.testing.assert_close(place.frames.offset.norm(dim=1), torch.ones(4).double(), rtol=0, atol=1e-3)
 
 
 @settings(max_examples=10)

@@ -262,7 +262,8 @@ class _Walk:
             self.eye = self._origins[origin].tolist()
 
     def _only_eye(self, i: int, begin: int) -> bool:
-        """Code whether component i has one viewpoint, `begin`, and which: often that of the one before."""
+        """Code whether component i has one viewpoint, `begin`, and then which: most often that of the
+        component before."""
         c, v, n = self.c, self.v, len(self.v["origins"])
         if not self.b.coarse or n == 0 or begin >= len(v["seen_from"]):
             return False

@@ -277,7 +277,8 @@ def _rounded(means: Tensor, covariances: Tensor, axis_order: Tensor, coarse: boo
 
 
 def _factors(ordered: Tensor) -> tuple[Tensor, Tensor]:
-    """d² (K, D), at least the smallest of the lattice, and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances."""
+    """d² (K, D) and L₂₁, L₃₁, L₃₂ (K, D(D−1)/2) of covariances; d² is at least the smallest of the
+    lattice."""
     least = 4.0 ** (LEAST_DEVIATION / PER_OCTAVE)
     v1 = ordered[:, 0, 0].clamp_min(least)
     floor = (v1 * 4.0 ** (-LARGEST_RATIO / PER_OCTAVE)).clamp_min(least)

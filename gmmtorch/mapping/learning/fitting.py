@@ -481,8 +481,8 @@ def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> 
     """The mixture of cells with mean features (N, F) and weights (N,), by EM from flat pieces."""
     means = features[:, 1 : 1 + dim].contiguous()
     moments = (features,) if fit.partition_by_moments else ()
-    pieces, n_pieces = partition(means, weight, fit.flatness, *moments)
+    pieces = partition(means, weight, fit.flatness, *moments)
     smallest_variance = fit.noise**2
-    first = maximization(pool(features, weight, pieces, n_pieces), smallest_variance)
+    first = maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
     step = em_step(Rows(features, weight, are_points=False), smallest_variance, fit.dtype)
     return run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters

@@ -208,9 +208,9 @@ def partition_components(
         features, mass, member, exact = em.quadratic_features(points), weight, None, points
     else:
         features, mass, member = pool_into_cells(points, n_cells, finest, weight)
-    pieces, n_pieces = partition(features[:, 1 : 1 + dim].contiguous(), mass, rule, features)
-    found = moments_of(features, mass, pieces, n_pieces, reg_covar, exact)
-    return found, pieces if member is None else pieces[member]
+    pieces = partition(features[:, 1 : 1 + dim].contiguous(), mass, rule, features)
+    labels = pieces.labels if member is None else pieces.labels[member]
+    return moments_of(features, mass, pieces.labels, pieces.n_pieces, reg_covar, exact), labels
 
 
 def moments_of(

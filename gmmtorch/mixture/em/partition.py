@@ -85,6 +85,13 @@ def surface_rule(noise: float, dim: int, min_points: float | None = None) -> Fla
     )
 
 
+class Partition(NamedTuple):
+    """labels (N,): the piece of each point; n_pieces: number of pieces, none of them empty."""
+
+    labels: Tensor
+    n_pieces: int
+
+
 def pool(features: Tensor, weight: Tensor, labels: Tensor, n_pieces: int) -> Tensor:
     """Weighted sums (n_pieces, F) of features (N, F) by label: the statistics of each piece."""
     sums = features.new_zeros(n_pieces, features.shape[1])
@@ -93,9 +100,8 @@ def pool(features: Tensor, weight: Tensor, labels: Tensor, n_pieces: int) -> Ten
 
 def partition(
     points: Tensor, weight: Tensor, rule: FlatnessRule, features: Tensor | None = None
-) -> tuple[Tensor, int]:
-    """Partition points (N, D), centred, float64, N ≥ 1, with weights (N,), into flat pieces: the piece of
-    each point, (N,), and the number of pieces, none of them empty.
+) -> Partition:
+    """Partition points (N, D), centred, float64, N ≥ 1, with weights (N,), into flat pieces.
 
     If the points are the means of cells, pass the cells' mean features `features` (N, F), so that the
     extent within the cells counts towards the thickness.
@@ -106,11 +112,11 @@ def partition(
         limit = -1 if rule.max_components is None else rule.max_components
         given = vars(rule) | {"n_levels": _MAX_LEVELS, "max_components": limit}
         cuts = CutRule(**given, thickness_priority=_THICKNESS_PRIORITY)
-        return piece_cuts(points, weight, features, cuts)
+        return Partition(*piece_cuts(points, weight, features, cuts))
     if points.device.type != "cpu" and n <= _MOST_ON_CPU:
         points_cpu, weight_cpu, features_cpu = on_cpu(points, weight, features)
-        labels, n_pieces = partition(points_cpu, weight_cpu, rule, features_cpu)
-        return labels.to(points.device), n_pieces
+        found = partition(points_cpu, weight_cpu, rule, features_cpu)
+        return found._replace(labels=found.labels.to(points.device))
     labels = torch.zeros(n, dtype=torch.int64, device=points.device)
     n_pieces = 1
     for _ in range(_MAX_LEVELS):
@@ -138,7 +144,7 @@ def partition(
         new_label = torch.cumsum(cut.long(), 0) - 1 + n_pieces
         labels = torch.where(cut[labels] & beyond, new_label[labels], labels)
         n_pieces += n_new
-    return labels, n_pieces
+    return Partition(labels, n_pieces)
 
 
 def _limit_splits(cut: Tensor, priority: Tensor, n_pieces: int, limit: int | None) -> Tensor:

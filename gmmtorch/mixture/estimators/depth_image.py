@@ -179,7 +179,8 @@ def _block_sums(valid: Tensor, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]
 
 
 def _some_value(valid: Tensor, image: Tensor) -> Tensor:
-    """The largest valid one of four values of each block (h, w), or 0: faster than the largest of all."""
+    """The largest valid one of four values of each block (h, w), or 0: much faster than the largest of
+    all."""
     near, far = _BLOCK // 4, _BLOCK - 1 - _BLOCK // 4
     four = [
         torch.where(valid[i::_BLOCK, j::_BLOCK], image[i::_BLOCK, j::_BLOCK], 0.0)

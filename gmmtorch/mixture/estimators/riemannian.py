@@ -26,6 +26,7 @@ import functools
 import math
 from collections import deque
 from dataclasses import KW_ONLY, dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -105,9 +106,15 @@ class RiemannianGaussianMixture(MixtureEstimator):
 # -- the objective and its manifold ---------------------------------------------------------------
 
 
-Frames = tuple[Tensor, Tensor, Tensor]
-"""H_k in parts, A (K, D+1, D), μ (K, D) and b (K, D+1): H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0,
-Σ⁻¹ = AᵀA and 1/s = ‖b‖²."""
+class Frames(NamedTuple):
+    """H_k in parts: H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0, Σ⁻¹ = AᵀA and 1/s = ‖b‖².
+
+    linear: A (K, D+1, D); means: μ (K, D); offset: b (K, D+1).
+    """
+
+    linear: Tensor
+    means: Tensor
+    offset: Tensor
 
 
 @dataclass(frozen=True)
@@ -125,7 +132,7 @@ class Likelihood:
         whiten = inverse_factor(safe_cholesky(covariances)).mT
         linear = nn.functional.pad(whiten, (0, 0, 0, 1))
         offset = nn.functional.pad(torch.zeros_like(means), (0, 1), value=1.0)
-        return self.evaluate((linear, means, offset), torch.log(weights.clamp_min(1e-300)))
+        return self.evaluate(Frames(linear, means, offset), torch.log(weights.clamp_min(1e-300)))
 
     def evaluate(self, frames: Frames, log_weights: Tensor) -> Iterate:
         """f and its gradient for frames of K components and log-weights η (K,), not necessarily
@@ -199,19 +206,20 @@ class Iterate:
 
     def move(self, tangent: Tensor) -> Iterate:
         """H ← exp(−Ξ/2) H and η ← η + Δη; then x is taken relative to the new means."""
-        linear, means, offset = self.frames
-        matrices, change = unpack_tangent(tangent, offset.shape[1])
+        matrices, change = unpack_tangent(tangent, self.frames.offset.shape[1])
         spread = torch.linalg.matrix_exp(-0.5 * matrices)
-        linear, offset = spread @ linear, (spread @ offset[:, :, None]).squeeze(-1)
+        linear = spread @ self.frames.linear
+        offset = (spread @ self.frames.offset[:, :, None]).squeeze(-1)
         basis, factor = torch.linalg.qr(linear)
         along = basis.mT @ offset[:, :, None]
         shift = torch.linalg.solve_triangular(factor, along, upper=True).squeeze(-1)
-        frames = linear, means - shift, offset - (basis @ along).squeeze(-1)
+        offset = offset - (basis @ along).squeeze(-1)
+        frames = Frames(linear, self.frames.means - shift, offset)
         return self.likelihood.evaluate(frames, self.log_weights + change)
 
     def parameters(self) -> Parameters:
         """The mixture, with s = 1."""
-        return Parameters(self.log_weights.exp(), self.frames[1], self.covariances)
+        return Parameters(self.log_weights.exp(), self.frames.means, self.covariances)
 
 
 def pack_tangent(matrices: Tensor, change: Tensor) -> Tensor:
@@ -281,7 +289,10 @@ def ascend(
 
 
 def _climb(point: Iterate, memory: Memory) -> Iterate:
-    """A higher point, or the same one; clears the memory if its direction does not ascend."""
+    """A higher point, or the same point if there is none.
+
+    Clears the memory if its direction does not ascend.
+    """
     while True:
         direction = point.bounded(quasi_newton(point, memory))
         length, found = search(point, direction)

@@ -19,7 +19,7 @@ from gmmtorch.linalg import dense_ranks, order_along_curve
 from gmmtorch.mapping.attributes.moments import _cell_sums
 from gmmtorch.mapping.learning.fitting import DepthFrame, PooledFrames, mean_range, pool_frames
 from gmmtorch.mixture.em.exact import quadratic_features, shift_features
-from gmmtorch.mixture.em.partition import Cells, FlatnessRule, partition, pool_into_cells
+from gmmtorch.mixture.em.partition import Cells, FlatnessRule, Partition, partition, pool_into_cells
 
 INTRINSICS = torch.tensor([[64.0, 0, 31.5], [0, 64.0, 23.5], [0, 0, 1]], dtype=torch.float64)
 SIDE = 0.125
@@ -249,12 +249,12 @@ def cells(n: int, dim: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
     return points, weight, features
 
 
-def cut_by_both(rule: FlatnessRule, *given_: Tensor) -> tuple[Tensor, int]:
+def cut_by_both(rule: FlatnessRule, *given_: Tensor) -> Partition:
     """The pieces of the fused kernel, after a comparison with those of the twin."""
     points, weight, *features = given_
     twin, fused = by_both(lambda: partition(points, weight, rule, *features))
-    assert fused[1] == twin[1]
-    assert torch.equal(fused[0], twin[0])
+    assert fused.n_pieces == twin.n_pieces
+    assert torch.equal(fused.labels, twin.labels)
     return fused
 
 
@@ -271,8 +271,8 @@ def test_pieces_are_those_of_the_twin(n, dim, seed, limit, least, thickness):
         thickness=thickness, length=0.5, min_weight=least, min_weight_thick=1.0, max_components=limit
     )
     found = cut_by_both(rule, *cells(n, dim, seed))
-    assert limit is None or found[1] <= limit
-    assert torch.bincount(found[0], minlength=found[1]).min() > 0
+    assert limit is None or found.n_pieces <= limit
+    assert torch.bincount(found.labels, minlength=found.n_pieces).min() > 0
 
 
 @pytest.mark.cpu_only
@@ -298,7 +298,7 @@ def test_many_workers_cut_the_same_pieces_as_one(n, dim, seed, limit, least, thi
 
 def test_pieces_without_extent_stay_whole():
     one = torch.zeros(5, 3, dtype=torch.float64)
-    assert cut_by_both(FlatnessRule(thickness=0.0, min_weight=1.0), one, one[:, 0] + 1)[1] == 1
+    assert cut_by_both(FlatnessRule(thickness=0.0, min_weight=1.0), one, one[:, 0] + 1).n_pieces == 1
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -307,7 +307,7 @@ def test_pieces_do_not_depend_on_the_unit(scale):
     rule = FlatnessRule(0.02 * scale, 0.5 * scale, max_components=40, outlier_gap=3 * scale)
     found = cut_by_both(rule, points * scale, weight)
     metres = cut_by_both(FlatnessRule(0.02, 0.5, max_components=40), points, weight)
-    assert found[1] == metres[1]
+    assert found.n_pieces == metres.n_pieces
 
 
 @pytest.mark.cpu_only
@@ -315,7 +315,7 @@ def test_outliers_become_pieces_of_their_own():
     points = torch.cat([torch.linspace(-1, 1, 50)[:, None].expand(50, 3), torch.full((1, 3), 90.0)]).double()
     points -= points.mean(0)
     rule = FlatnessRule(thickness=0.02, length=1.0, min_weight=5.0, min_weight_thick=5.0)
-    assert cut_by_both(rule, points, torch.ones(51).double())[0][-1] == 1
+    assert cut_by_both(rule, points, torch.ones(51).double()).labels[-1] == 1
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
