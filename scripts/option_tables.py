@@ -73,9 +73,8 @@ def table(command: str, parts: list[str]) -> str:
     for name in parts:
         if name in groups and name != "study":
             lines.append(f"| `{name}` | `{chosen[name]}` | {', '.join(f'`{c}`' for c in groups[name])} |")
-    for row in [
-        row for first in ("", *groups) if not first or first in parts for row in rows_of(command, first)
-    ]:
+    wanted = ["", *(first for first in groups if first in parts)]
+    for row in (row for first in wanted for row in rows_of(command, first)):
         first = row.name.split(".")[0]
         if first not in parts:
             continue

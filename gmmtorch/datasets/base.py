@@ -198,7 +198,7 @@ class Dataset(Sequence[Scan]):
 
     def _note_missing(self, channels: Collection[str], index: int) -> None:
         """Counts a scan with only these of the `attributes`."""
-        for name in set(self.attributes).difference(channels):
+        for name in (name for name in self.attributes if name not in channels):
             self._skip(f"read without {name}, which they lack", index)
 
     def can_continue(self, n_read: int) -> bool:

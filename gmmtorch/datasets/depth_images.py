@@ -284,8 +284,8 @@ class TumRgbd(_DepthDataset):
     """Depth images as scans, in the order of their times, with poses interpolated at their times.
 
     Images without a pose are left out and counted. poses: another trajectory file with times; None:
-    groundtruth.txt. intrinsics: fx, fy, cx, cy in pixels; None: `_INTRINSICS`. Colours are those of the image
-    in rgb.txt that is nearest in time, within 20 ms.
+    groundtruth.txt. intrinsics: fx, fy, cx, cy in pixels; None: 525, 525, 319.5, 239.5. Colours are
+    those of the image in rgb.txt that is nearest in time, within 20 ms.
     """
 
     _poses: Tensor

@@ -89,15 +89,9 @@ class ScanFolder(Dataset):
             usual |= points.isnan()  # a beam without return
         if not bool(usual.all()):
             self._skip("points dropped: their coordinates are not finite", index)
-        channels = _noted_channels(self, self._files[index], index)
+        channels = read_channels(self._files[index], self.attributes) if self.attributes else {}
+        self._note_missing(channels, index)
         return self.ranges.posed(points, self._poses[index], channels)
-
-
-def _noted_channels(scans: Dataset, file: Path, index: int) -> dict[str, Tensor]:
-    """The channels in a file of those that are wanted; a scan that lacks some is counted."""
-    channels = read_channels(file, scans.attributes) if scans.attributes else {}
-    scans._note_missing(channels, index)
-    return channels
 
 
 def _read_poses(path: Path) -> Tensor:
@@ -141,7 +135,8 @@ class PcdViewpoint(Dataset):
 
     def _read(self, index: int) -> Scan:
         path = self._files[index]
-        channels = _noted_channels(self, path, index)
+        channels = read_channels(path, self.attributes) if self.attributes else {}
+        self._note_missing(channels, index)
         return self.ranges.scan(read_cloud(path), _viewpoint(path), None, channels)
 
 

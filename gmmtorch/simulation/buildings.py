@@ -284,15 +284,21 @@ def building_3d(generator: torch.Generator) -> World3D:
     in_hall: dict[DrawPiece, int] = {pillar: 3, table: 2, shelf: 4, chair: 3, boxes: 2, globe: 1, barrel: 1}
     in_room: dict[DrawPiece, int] = {table: 1, shelf: 2, chair: 1, boxes: 2, barrel: 1}
     surfaces = [
-        box((-0.1, -0.1, -_THICKNESS), (14.1, 10.1, 0.0)),
-        box((-0.1, -0.1, CEILING), (14.1, 10.1, CEILING + _THICKNESS)),
-        box((14.1, 3.9, -_THICKNESS), (28.1, 6.1, 0.0)),
-        box((14.1, 3.9, _CORRIDOR_CEILING), (28.1, 6.1, _CORRIDOR_CEILING + _THICKNESS)),
+        *_floors_and_ceilings(),
         *_hall_walls(),
         *furnish(_HALL_3D, path, generator, in_hall),
         *furnish(_ROOM_3D, path, generator, in_room),
     ]
     return World3D(torch.cat(surfaces), path)
+
+
+def _floors_and_ceilings() -> list[Tensor]:
+    return [
+        box((-0.1, -0.1, -_THICKNESS), (14.1, 10.1, 0.0)),
+        box((-0.1, -0.1, CEILING), (14.1, 10.1, CEILING + _THICKNESS)),
+        box((14.1, 3.9, -_THICKNESS), (28.1, 6.1, 0.0)),
+        box((14.1, 3.9, _CORRIDOR_CEILING), (28.1, 6.1, _CORRIDOR_CEILING + _THICKNESS)),
+    ]
 
 
 def _hall_walls() -> list[Tensor]:

@@ -42,6 +42,7 @@ ConfigStore.__deepcopy__ = lambda store, memo: store
 Hydra.get_mode = lambda hydra, config_name, overrides: None
 _CHOSEN: dict[str, DefaultsList] = {}
 _MERGED: dict[str, DictConfig] = {}
+_merge = ConfigLoaderImpl._compose_config_from_defaults_list
 
 
 def _chosen_once(repo: Any, config_name: str, overrides_list: list[Any], **how: Any) -> DefaultsList:
@@ -58,11 +59,10 @@ def _chosen_once(repo: Any, config_name: str, overrides_list: list[Any], **how: 
 def _merged_once(loader: ConfigLoaderImpl, defaults: list[Any], repo: Any) -> DictConfig:
     key = repr((defaults, repo.get_sources()))
     if key not in _MERGED:
-        _MERGED[key] = merge(loader, defaults, repo)
+        _MERGED[key] = _merge(loader, defaults, repo)
     return deepcopy(_MERGED[key])
 
 
-merge = ConfigLoaderImpl._compose_config_from_defaults_list
 config_loader_impl.create_defaults_list = _chosen_once
 ConfigLoaderImpl._compose_config_from_defaults_list = _merged_once
 

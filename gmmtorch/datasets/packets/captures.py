@@ -36,8 +36,6 @@ _ETHERNET, _VLAN, _IPV4 = 1, (b"\x81\x00", b"\x88\xa8"), b"\x08\x00"
 _UDP = 17
 _CUT = "the file is cut off there"
 _DAMAGED = "the blocks after it contradict each other"
-
-
 _MOST_TOPICS = 256
 _DATAGRAMS = "UDP datagrams"  # the type of datagrams that are not of a lidar, which are not read
 

@@ -179,18 +179,22 @@ def pool_frames(frames: Sequence[DepthFrame], finest: float, max_cells: int) -> 
     rays, shortest = np.stack([first, across, down, origin - reference], 1), camera[:, :2].min(1)
     depths, max_range = [frame.depth for frame in frames], np.array([frame.max_range for frame in frames])
 
+    def side_of(thirds: int) -> float:
+        return finest * 2 ** (thirds / 3)
+
     def pooled(thirds: int) -> DepthCells | None:
-        side = finest * 2 ** (thirds / 3)
+        side = side_of(thirds)
         return depth_cells(DepthViews(depths, rays / side, 1 / (shortest * side), max_range), side, max_cells)
 
-    thirds, cells = 0, pooled(0)
-    if cells is None:
+    first = pooled(0)
+    if first is None:
         scans = [frame.scan() for frame in frames]  # raises for points that are too far away
         away = [scan.points - scan.points.new_tensor(reference) for scan in scans if len(scan.points)]
         extent = max(float(offsets.abs().max()) for offsets in away)
-        found = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / finest + 2)))
-        thirds, cells = found
-    side = finest * 2 ** (thirds / 3)
+        thirds, cells = coarsest_allowed(pooled, 3 * math.ceil(math.log2(extent / finest + 2)))
+    else:
+        thirds, cells = 0, first
+    side = side_of(thirds)
     weight = cells.sums[:, 0].contiguous()
     total = (cells.sums[:, 1:4] + weight[:, None] * cells.corners).sum(0)
     center = total / weight.sum().clamp_min(1)

@@ -124,7 +124,10 @@ def run_truncated(
     """
     if is_m_step_fused(parameters.means.shape[1], rows.values, rows.weight, *parameters):
         found = fused_truncated_em(
-            *(rows.values, rows.weight, owner, parameters),
+            rows.values,
+            rows.weight,
+            owner,
+            parameters,
             (settings.reg_covar, settings.tol, settings.previous_bound, settings.max_iter),
             settings.n_candidates if candidates is None else candidates,
             lambda mixture: centered_parameters(Parameters(*mixture)),
