@@ -107,9 +107,6 @@ def check_symmetric(matrices: Tensor, name: str) -> Tensor:
     return matrices
 
 
-# -- devices ---------------------------------------------------------------------------------------
-
-
 def on_cpu(*tensors: Tensor) -> tuple[Tensor, ...]:
     """The tensors on the CPU, without gradients. Python waits once for their device, not for each tensor."""
     tensors = tuple(tensor.detach() for tensor in tensors)
@@ -136,9 +133,6 @@ def all_equal(pairs: Iterable[tuple[Tensor, Tensor]]) -> bool:
     if any(one.shape != other.shape for one, other in pairs):
         return False
     return bool(torch.stack([(one == other).all() for one, other in pairs]).all())
-
-
-# -- sorting: NumPy's vectorised sorts on the CPU, torch's elsewhere ------------------------------
 
 
 def order_along_curve(places: Tensor, levels: int = 1) -> Tensor:

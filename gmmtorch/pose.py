@@ -40,8 +40,6 @@ class Pose:
     rotation: Tensor
     translation: Tensor
 
-    # -- makers ---------------------------------------------------------------------------------------
-
     @staticmethod
     def identity(dim: int, *shape: int, device: torch.device | str | None = None) -> Pose:
         """The motion, or a batch of this shape, that moves nothing."""
@@ -141,8 +139,6 @@ class Pose:
         """The motions of some batches, one after the other."""
         return Pose(torch.cat([p.rotation for p in poses]), torch.cat([p.translation for p in poses]))
 
-    # -- batches --------------------------------------------------------------------------------------
-
     def __len__(self) -> int:
         return len(self.translation) if self.translation.ndim > 1 else 1
 
@@ -152,8 +148,6 @@ class Pose:
     def to(self, device: torch.device | str | None) -> Pose:
         """The motions on another device."""
         return Pose(self.rotation.to(device), self.translation.to(device))
-
-    # -- numbers --------------------------------------------------------------------------------------
 
     @property
     def dim(self) -> int:
@@ -230,8 +224,6 @@ class Pose:
         found = Pose.identity(3, *self.translation.shape[:-1], device=self.translation.device)
         found.rotation[..., :2, :2], found.translation[..., :2] = self.rotation, self.translation
         return found
-
-    # -- motions --------------------------------------------------------------------------------------
 
     def inverse(self) -> Pose:
         """The motions back.

@@ -354,9 +354,6 @@ def start_frame(scans: Dataset, index: int) -> Tensor:
     return Pose.from_yaw(yaw, origin).matrix
 
 
-# -- rows of numbers in text files -------------------------------------------------------------------
-
-
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf|infinity)", re.I | re.A)
 # C runtimes print these, Microsoft's older ones rounded to the precision: 1.#QNAN, 1.#INF00, 1.#J, 1.$
 _NOT_FINITE = re.compile(

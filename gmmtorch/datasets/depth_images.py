@@ -45,9 +45,6 @@ _UPRIGHT = {
 _COLOUR_INTRINSICS, _COLOUR_POSE = "color-intrinsics.txt", "color-pose.txt"
 
 
-# -- colours -----------------------------------------------------------------------------------------
-
-
 _MAX_COLOUR_PIXELS = 1 << 25
 _BLOCK = 4  # pixels: a side of the blocks of the colour image in which points hide each other
 _BEHIND = 0.05  # share of the depth by which a hidden point is behind a nearer one in its block
@@ -93,9 +90,6 @@ class ColourCamera(NamedTuple):
             inside &= depth <= (1 + _BEHIND) * nearest[block]
         found = linear_colours(torch.arange(256) / 255)[image[v, u].long()]
         return torch.where(inside[:, None], found, torch.nan)
-
-
-# -- folders of images -------------------------------------------------------------------------------
 
 
 class _DepthDataset(Dataset):
@@ -271,9 +265,6 @@ def _matrix(path: Path, size: int) -> Tensor:
             f"{path} holds an array of shape {matrix.shape}; expected a finite {size}×{size} matrix."
         )
     return torch.from_numpy(matrix)
-
-
-# -- the TUM RGB-D benchmark -------------------------------------------------------------------------
 
 
 _INTRINSICS = (525.0, 525.0, 319.5, 239.5)

@@ -154,9 +154,6 @@ def _viewpoint(path: Path) -> Tensor:
     return origin
 
 
-# -- KITTI -------------------------------------------------------------------------------------------
-
-
 _CALIBRATION = "Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
 
 
@@ -294,9 +291,6 @@ def _calibration(path: Path) -> Pose:
     raise DataError(
         f"{path} has no row Tr (camera ← Velodyne); a calibration without rotation: '{_CALIBRATION}'."
     )
-
-
-# -- nuScenes ----------------------------------------------------------------------------------------
 
 
 _BLOCK_BYTES, _MOST_RECORDS = 1 << 22, 1 << 16

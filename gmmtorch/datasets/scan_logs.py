@@ -125,9 +125,6 @@ def _parse(words: list[str], path: Path, number: int) -> Tensor:
     return record
 
 
-# -- OctoMap -----------------------------------------------------------------------------------------
-
-
 _LINE_BYTES = 1 << 12
 _COUNT = struct.Struct("<I")
 _POINT = np.dtype([("length", "<i4"), ("values", "<f8", 3)])
@@ -217,9 +214,6 @@ def _node_positions(file: io.BufferedIOBase, where: str) -> list[int]:
             positions.append(position)
         position += len(line)
     return positions
-
-
-# -- binary graphs --------------------------------------------------------------------------------------
 
 
 def _binary_nodes(file: io.BufferedIOBase, where: str) -> list[int]:

@@ -164,9 +164,6 @@ def to_nanoseconds(seconds: np.ndarray) -> np.ndarray:
     return whole.astype(np.int64) * NANOSECONDS + np.round((seconds - whole) * 1e9).astype(np.int64)
 
 
-# -- data sets with other poses ----------------------------------------------------------------------
-
-
 _MAX_GAP = 2.0
 
 

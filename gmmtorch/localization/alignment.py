@@ -208,9 +208,6 @@ def _steps(sums: AlignmentSums, scale: Tensor, longest: float) -> Tensor:
     return step * (longest / length.clamp_min(longest)) * scale
 
 
-# -- starts of a search ---------------------------------------------------------------------------
-
-
 def differences(some: Pose, others: Pose, distance: float, angle: float) -> Tensor:
     """How different motions are (A, B): the larger of the shift in `distance` and the turn in `angle`."""
     shift = torch.cdist(some.translation, others.translation)

@@ -398,9 +398,6 @@ def _scatter(pose: Pose, others: Pose) -> Tensor:
     return steps.T @ steps / len(steps)
 
 
-# -- free space -----------------------------------------------------------------------------------
-
-
 class View(NamedTuple):
     """Of B poses: shares (B,) of the points that lie in free space, of the points that no earlier scan could
     see, and of the earlier points that the scan looks through."""

@@ -64,9 +64,6 @@ def composed(first: Location, then: Location) -> Location:
     return replace(then, pose=(before @ after).matrix, covariance=covariance)
 
 
-# -- predictions ----------------------------------------------------------------------------------
-
-
 def measured_motion(motion: ArrayLike, dim: int, device: torch.device) -> Pose | Tensor:
     """A motion (D+1, D+1), or its rotation (D, D) alone, as a tensor. Raises `InvalidArgumentError`."""
     matrix = as_tensor(motion, "motion", torch.float64, device).detach().clone()

@@ -239,8 +239,6 @@ class Odometry:
         found &= ~is_apart
         return Trajectory(best.poses.matrix, best.covariances, found, int(used.sum()), doubts)
 
-    # -- one scan -------------------------------------------------------------------------------------
-
     def _checked(self, points: ArrayLike, seconds: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
         rows = as_tensor(points, "points", torch.float64).detach().cpu()
         dims = (2, 3) if not self._poses else (self._poses[0].dim,)
@@ -424,9 +422,6 @@ def _bridged(poses: Pose, found: Tensor) -> Pose:
     is_between = ~found & (first < number) & (number < last)
     shift = torch.where(is_between[:, None], way.translation, poses.translation)
     return Pose(torch.where(is_between[:, None, None], way.rotation, poses.rotation), shift)
-
-
-# -- recordings -----------------------------------------------------------------------------------
 
 
 class PosedRecording(NamedTuple):

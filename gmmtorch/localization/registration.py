@@ -195,9 +195,6 @@ def yaw_starts(source: Surfaces, target: Surfaces, n: int = 12) -> Tensor:
     return Pose(turned.rotation, there - turned.rotation @ here).matrix
 
 
-# -- mixtures -------------------------------------------------------------------------------------
-
-
 def _check_together(source: Parameters, target: Parameters) -> None:
     for name, mixture in (("source", source), ("target", target)):
         if not len(mixture.weights):
@@ -256,9 +253,6 @@ def _levels(mixture: Parameters, blurs: list[float]) -> list[Parameters]:
     return levels
 
 
-# -- motions --------------------------------------------------------------------------------------
-
-
 def _starts(initial: ArrayLike | None, dim: int, device: torch.device) -> Pose:
     """Initial poses (B)."""
     if initial is None:
@@ -296,9 +290,6 @@ def _promising(motions: Pose, log_score: Tensor, radius: float, apart: float) ->
     return order[worth][:_BEST_KEPT]
 
 
-# -- trust ----------------------------------------------------------------------------------------
-
-
 def _widths(hessian: Tensor, scale: Tensor) -> Tensor:
     """Metres (B,) that the source can slide or turn; infinite where the Hessian (B, F, F) is not definite."""
     least = torch.linalg.eigvalsh(hessian * scale[:, None] * scale)[:, 0]
@@ -318,9 +309,6 @@ def _doubts(share: list[float], width: float, radius: float, converged: bool) ->
     if others > _AMBIGUOUS * share[0]:
         doubts.append(f"another pose has an overlap of {others:.3f}, against {share[0]:.3f}")
     return tuple(doubts)
-
-
-# -- overlap --------------------------------------------------------------------------------------
 
 
 class Overlap(NamedTuple):

@@ -328,9 +328,6 @@ def _places(surfaces: Components, center: Tensor) -> Tensor:
     return origins[first.scatter_reduce(0, member, torch.arange(len(origins)).to(member), "amin")]
 
 
-# -- the scans of a data set -----------------------------------------------------------------------
-
-
 class ScanLocation(NamedTuple):
     """number: of the scan. time: seconds, or the number if the data set has no times. location: in the map.
     seconds: computing time of the tracker.

@@ -167,8 +167,6 @@ class GaussianMap(MapState):
         own = {**vars(self.query_options), "resolution": self.resolution, "method": self.method}
         return GaussianMap.of(self.components() if components is None else components, **{**own, **options})
 
-    # -- learning -------------------------------------------------------------------------------------
-
     def insert(self, scan: Scan) -> None:
         """Learns from a scan. Queries use it at once; its components are final when their window is full.
 
@@ -303,8 +301,6 @@ class GaussianMap(MapState):
         """Number of components, those of the unfinished window included."""
         return self.n_final + len(self._upcoming()[0]) - len(self._last) if self.dim is not None else 0
 
-    # -- queries --------------------------------------------------------------------------------------
-
     def occupancy(
         self, points: ArrayLike, resolution: float | None = None, method: str | None = None
     ) -> Tensor | np.ndarray:
@@ -378,8 +374,6 @@ class GaussianMap(MapState):
             )
             self._is_stale = False
         return self._query
-
-    # -- files and state ------------------------------------------------------------------------------
 
     def _file(self, components: Components | None = None) -> bytes:
         """The map's file. `components`: instead of all."""

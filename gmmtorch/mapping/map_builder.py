@@ -209,8 +209,6 @@ class MapBuilder(Generic[AnyMap]):
         way = {"metres": record.metres, "seconds": record.seconds}
         history.append({"n_read": record.n_read, **size, **way, "memory_bytes": resident_bytes()})
 
-    # -- checkpoints ----------------------------------------------------------------------------------
-
     def save(self, path: str | Path, run: Mapping[str, Any]) -> None:
         """Writes everything that building continues from, atomically; of a `TiledMap` only at the ends of
         windows, what is not in its files.
@@ -378,8 +376,6 @@ class WindowMotions:
             return torch.where(known, windows[torch.from_numpy(row).clamp_max(len(windows) - 1)], -1)
 
         return found
-
-    # -- checkpoints ----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """Everything, as tensors."""

@@ -121,8 +121,6 @@ class MapState(DeviceModule):
         options = self.resolution, self.method, self.codec, self.robot, self.query_options
         return MapSettings(*options, self._next_doubts.time)
 
-    # -- learning -------------------------------------------------------------------------------------
-
     def _final(self) -> Components:
         """The components without those of the unfinished window, not rounded."""
         return Components.concatenate([*self._parts_before, self._last])
@@ -264,8 +262,6 @@ class MapState(DeviceModule):
     def _forget(self) -> None:
         """Drops what was computed from the components. The query keeps what the next one can use."""
         self._learned, self._all_rounded, self._is_stale, self._fitted = None, None, True, None
-
-    # -- torch ----------------------------------------------------------------------------------------
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         """Moves the map and its pending scans between devices."""

@@ -204,8 +204,6 @@ class MixtureDensity(DensityMixin, BaseEstimator, DeviceModule):
             return spread.rsqrt()
         return inverse_factor(safe_cholesky(spread.view(-1, *spread.shape[-2:]))).view_as(spread)
 
-    # -- buffers and conversions ------------------------------------------------------------------
-
     def _set_buffers(self, weights: Tensor, means: Tensor, covariances: Tensor) -> None:
         self._fitted_type = self.covariance_type
         if covariances.ndim == 3:

@@ -200,8 +200,6 @@ class MixtureEstimator(MixtureDensity):
         """Fit, then return the most likely component (N,) of each point."""
         return self.fit(X, y, sample_weight).predict(X)
 
-    # -- steps that every fit begins and ends with ------------------------------------------------
-
     def _prepare(self, X: Array, sample_weight: Array | None, reset: bool = True) -> Cloud:
         """The checked points of non-zero weight, relative to their weighted mean.
 
@@ -331,8 +329,6 @@ class MixtureEstimator(MixtureDensity):
         self.n_iter_ = len(self.lower_bounds_)
         self.converged_ = bool(converged)
 
-    # -- extra tensors of a subclass --------------------------------------------------------------
-
     def _extra_tensors(self) -> dict[str, Tensor]:
         """The existing tensors of `_extra_names`: float64, int64 or bool."""
         return {name: getattr(self, name) for name in self._extra_names if name in self._buffers}
@@ -351,8 +347,6 @@ class MixtureEstimator(MixtureDensity):
     def _transformed_extra(self, rotation: Tensor, translation: Tensor) -> dict[str, Tensor]:
         """The extra tensors after a rigid motion x ↦ R x + t. A subclass transforms those that need it."""
         return self._extra_tensors()
-
-    # -- states, motions and files ----------------------------------------------------------------
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         """Load the state of a fitted mixture with any K and D, whether this one is fitted or not."""

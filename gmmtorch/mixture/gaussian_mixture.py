@@ -126,8 +126,6 @@ class GaussianMixture(MixtureEstimator):
     verbose: int = 0
     verbose_interval: int = 10
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
         points, weight, center = cloud
         rows, generator = self._rows(points, weight), as_generator(self.random_state)
@@ -328,8 +326,6 @@ class GaussianMixture(MixtureEstimator):
         given = self.weights, self.means, self._typed_covariances()
         weights, means, covariances = (value.to(points.device) for value in given)
         return Parameters(weights, means - center, covariances)
-
-    # -- arguments --------------------------------------------------------------------------------
 
     def check_parameters(self, n_points: int | None = None) -> None:
         super().check_parameters(n_points)

@@ -247,9 +247,6 @@ def _mutual_choices(i: Tensor, j: Tensor, costs: Tensor, k: int) -> tuple[Tensor
     return i[mutual], j[mutual]
 
 
-# -- arguments and order --------------------------------------------------------------------------
-
-
 def parameters_of(mixture: Parameters | MixtureEstimator, name: str) -> Parameters:
     """Parameters of a mixture or of a fitted estimator, as tensors without gradients.
 
@@ -290,9 +287,6 @@ def _in_order_given(labels: Tensor, n: int) -> tuple[Tensor, Tensor]:
     first = rows.new_full((n,), labels.shape[0]).scatter_reduce_(0, labels, rows, "amin")
     kept = first.argsort()
     return torch.empty_like(kept).scatter_(0, kept, torch.arange(n, device=labels.device))[labels], kept
-
-
-# -- estimators -----------------------------------------------------------------------------------
 
 
 def merge(
@@ -351,9 +345,6 @@ def merge(
     found = GaussianMixture.from_parameters(*(values if isinstance(a.means_, Tensor) else arrays), **options)
     found.n_samples_seen_ = total
     return found
-
-
-# -- moments and costs of merges ------------------------------------------------------------------
 
 
 def merge_components(

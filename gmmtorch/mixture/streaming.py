@@ -180,9 +180,6 @@ def _in_chunks(source: PointChunks | ArrayLike) -> PointChunks:
     return source if isinstance(source, PointChunks) else in_memory(source, "source")
 
 
-# -- one iteration --------------------------------------------------------------------------------
-
-
 def _noted(step: loop.Step[Parameters], done: list[float], write: Write | None) -> loop.Step[Parameters]:
     """The step, after which its bound is added to `done`, and its result written."""
 
@@ -261,9 +258,6 @@ def _stream_step(
     return step
 
 
-# -- the start ------------------------------------------------------------------------------------
-
-
 def survey_all(
     source: PointChunks, sample_points: int | None, seed: int, processes: Processes = SINGLE_PROCESS
 ) -> Survey:
@@ -331,9 +325,6 @@ def run_facts(mixture: GaussianMixture, survey: Survey, e_step: str) -> RunFacts
         "n_points": survey.n_points,
         "checksum": survey.checksum,
     }
-
-
-# -- checkpoints ----------------------------------------------------------------------------------
 
 
 class State(NamedTuple):

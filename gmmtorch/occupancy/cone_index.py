@@ -241,8 +241,6 @@ class ConeIndex:
         first, last = ((ends - self.origin) / self.side).floor().long().tolist()
         self._box = [a - 1 for a in first], [b - a + 3 for a, b in zip(first, last, strict=True)]
 
-    # -- lists that are kept --------------------------------------------------------------------------
-
     def _drop_all(self) -> None:
         none = torch.zeros(0, dtype=torch.int64, device=self.hulls.table.device)
         self._buckets = [(none, none)] * self._n_levels  # of each level, sorted keys and the buckets' lists
@@ -320,8 +318,6 @@ class ConeIndex:
         made = hulls.near(self.lists, lists, centers, radii)
         number[missing] = self._add(level, cells[missing], made)
         return number
-
-    # -- queries --------------------------------------------------------------------------------------
 
     @property
     def _limit(self) -> int:

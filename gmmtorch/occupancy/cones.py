@@ -142,9 +142,6 @@ class WhitenedCones(NamedTuple):
         return (self.matrix * vector[None]).sum(1)
 
 
-# -- geometry in the whitened frame -----------------------------------------------------------------
-
-
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """a·b over coordinates: (…, D, P) → (…, P)."""
     return (a * b).sum(-2)

@@ -107,8 +107,6 @@ class OccupancyGrid(TensorFileMap):
         hits, misses = cells.at_points(query)
         return torch.sigmoid(self.log_odds.hit * hits + self.log_odds.miss * misses)
 
-    # -- files ------------------------------------------------------------------------------------
-
     def _facts(self) -> dict[str, Any]:
         facts: dict[str, Any] = {"dim": self.dim, "resolution": self.resolution, "prior": self.prior}
         return facts if self.log_odds is None else {**facts, "log_odds": vars(self.log_odds)}

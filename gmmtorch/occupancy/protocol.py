@@ -111,8 +111,6 @@ class BaselineMap(ABC):
             theta = self._answer(query.to(self.device)).to(query.device)
         return theta if isinstance(points, Tensor) else theta.detach().cpu().numpy()
 
-    # -- files ------------------------------------------------------------------------------------
-
     @property
     def nbytes(self) -> int:
         """Bytes of the file that `save` writes; 0 for an empty map."""
@@ -141,8 +139,6 @@ class BaselineMap(ABC):
         made._start(dim, torch.device("cpu"))
         made.dim = dim
         return made
-
-    # -- implemented by each map ------------------------------------------------------------------
 
     @property
     @abstractmethod

@@ -226,8 +226,6 @@ def _pillar(g: torch.Generator) -> Piece:
     return Piece((0.6, 0.6), False, _round)
 
 
-# -- the hall -------------------------------------------------------------------------------------
-
 _CORRIDOR_CEILING = 2.6
 _HALL_3D = Room(0.1, 0.1, 8.9, 9.9)
 _ROOM_3D = Room(9.1, 0.1, 13.9, 9.9)

@@ -177,9 +177,6 @@ def _drawn(room: Room, length: float, width: float, at_wall: bool, generator: to
     return Footprint(x, uniform(room.y_min, room.y_max, generator), math.pi / 2, length, width)
 
 
-# -- solids ---------------------------------------------------------------------------------------
-
-
 def prism(outline: Tensor, bottom: float, top: float) -> Tensor:
     """A prism (4C − 4, 3, 3) over a convex, counter-clockwise outline (C, 2), between two heights (m)."""
     low = torch.cat([outline, torch.full_like(outline[:, :1], bottom)], 1)
@@ -232,9 +229,6 @@ def _fan(corners: Tensor) -> Tensor:
 
 
 UNIT_CUBE = box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-
-
-# -- furniture of a hall ----------------------------------------------------------------------------
 
 
 def table(generator: torch.Generator) -> Piece:
@@ -327,9 +321,6 @@ def _cylinder(spot: Footprint, height: float, n_sides: int) -> Tensor:
 def _legs(spot: Footprint, height: float, width: float) -> list[Tensor]:
     feet = rectangle(spot.length - width, spot.width - width)
     return [prism(spot.to_world(rectangle(width, width) + foot), 0.0, height) for foot in feet]
-
-
-# -- pallet racks -----------------------------------------------------------------------------------
 
 
 class Bays(NamedTuple):

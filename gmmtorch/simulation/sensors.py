@@ -141,9 +141,6 @@ def simulate_scan(sensor: RangeSensor, pose: ArrayLike, world: World, generator:
     return Scan(ends[~no_return], Pose.from_matrix(pose).translation, ends[no_return])
 
 
-# -- paths ----------------------------------------------------------------------------------------
-
-
 def smooth_path(waypoints: ArrayLike, spacing: float = 0.05) -> Tensor:
     """A smooth path (P, 2) along waypoints (W, 2), with a point every `spacing` metres.
 

@@ -14,8 +14,6 @@ from gmmtorch.errors import DataError
 MOST_CALIBRATION_BYTES = 1 << 20
 _SECOND = 1_000_000  # µs, after which the clock in a packet begins again
 
-# -- nominal elevations and azimuths of channels in degrees -------------------------------------------
-
 
 def _degrees(text: str) -> np.ndarray:
     return np.array(text.split(), np.float64)
@@ -68,9 +66,6 @@ def read_angles(path: Path) -> Angles:
         raise DataError(f"{path} has no angles; expected rows of channel, elevation and azimuth in degrees.")
     table = table[np.argsort(table[:, 0], kind="stable")]
     return Angles(table[:, 1], table[:, 2])
-
-
-# -- models ------------------------------------------------------------------------------------------
 
 
 class Model(NamedTuple):

@@ -117,9 +117,6 @@ def _velodyne_decoder() -> Callable[[list[tuple[float, bytes]]], np.ndarray]:
     return decode
 
 
-# -- metadata beside a recording ---------------------------------------------------------------------
-
-
 _STRING = "std_msgs/msg/String"
 _MOST_FILES = 200
 

@@ -231,9 +231,6 @@ def _records(
     return np.array(starts), np.array(lengths).reshape(count, len(steps))
 
 
-# -- meshes ------------------------------------------------------------------------------------------
-
-
 _INDICES = ("vertex_indices", "vertex_index")
 _STL_HEADER_BYTES = 80
 _STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])

@@ -154,9 +154,6 @@ def _mix_bits(state: np.ndarray) -> np.ndarray:
     return mixed
 
 
-# -- surveys --------------------------------------------------------------------------------------
-
-
 class Survey(NamedTuple):
     """Statistics of a point source.
 
@@ -238,9 +235,6 @@ def _checksum(points: Tensor, rows: Tensor) -> int:
     for axis in range(bits.shape[1]):
         state = _mix_bits(state * _ODD + bits[:, axis])
     return int((state >> np.uint64(64 - _CHECKSUM_BITS)).sum(dtype=np.uint64)) % (1 << _CHECKSUM_BITS)
-
-
-# -- files of every format ---------------------------------------------------------------------------
 
 
 _READERS: dict[str, Callable[[Path], Rows]] = dict(

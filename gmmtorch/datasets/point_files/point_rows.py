@@ -155,9 +155,6 @@ def check_count(path: Path, first: int, found: int, wanted: int, announced: int)
         )
 
 
-# -- what is checked before a point file is read -----------------------------------------------------
-
-
 AXES = ("x", "y", "z")
 PACKED = ("rgb", "rgba")
 """Fields of 32 bits, 0xAARRGGBB, which PCL also calls floating numbers."""

@@ -282,9 +282,6 @@ class _Chunked(ABC):
         """Whether the file has the end that a closed one has."""
 
 
-# -- ROS 1 (wiki.ros.org/Bags/Format/2.0) ------------------------------------------------------------
-
-
 _BAG_MAGIC = b"#ROSBAG V2.0\n"
 _CONNECTION, _CHUNK, _MESSAGE, _CHUNK_INFO = 7, 5, 2, 6
 _CHUNK_HEADER = 128  # bytes before the field op in the header of a chunk, at most
@@ -369,9 +366,6 @@ def _ros1_fields(header: bytes) -> dict[bytes, bytes]:
             raise DataError("a header is damaged")
         fields[name] = value
     return fields
-
-
-# -- MCAP (mcap.dev/spec) ----------------------------------------------------------------------------
 
 
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -470,9 +464,6 @@ def _mcap_text(content: bytes, at: int) -> tuple[str, int]:
     if at + 4 + length > len(content):
         raise DataError("a text is cut off")
     return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
-
-
-# -- SQLite ------------------------------------------------------------------------------------------
 
 
 _SQLITE_MAGIC = b"SQLite f"

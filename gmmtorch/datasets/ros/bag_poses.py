@@ -157,9 +157,6 @@ def mount_of(extrinsic: list[float] | None) -> Pose | None:
         ) from error
 
 
-# -- one pass over a bag -----------------------------------------------------------------------------
-
-
 _log = logging.getLogger(__name__)
 _HEAD_BYTES = 1024
 _STAMP_BYTES = 12  # in which headers differ: the CDR head and the stamp, or the number and the stamp of ROS 1

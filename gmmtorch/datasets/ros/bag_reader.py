@@ -257,9 +257,6 @@ def _stated(path: Path) -> tuple[int, int]:
     return n_messages, begin + duration
 
 
-# -- what a hostile bag can make its reader allocate -------------------------------------------------
-
-
 MAX_CHUNK_BYTES = 1 << 28
 """Limit of an unpacked chunk or message; recorders write chunks of about a megabyte."""
 

@@ -216,9 +216,6 @@ def nearest_names(names: list[str], topic: str) -> list[str]:
     return [name for name in names if shared(name) == max(map(shared, names))]
 
 
-# -- facts ------------------------------------------------------------------------------------------
-
-
 _HEADER_STAMP, _TF_STAMP = 4, 8  # bytes before the stamp of a header, and of the first transform
 
 

@@ -363,9 +363,6 @@ class SeveralSensors(Dataset):
         return self._bags[sensor].pose(number)
 
 
-# -- rotations by an IMU -----------------------------------------------------------------------------
-
-
 IMU_GAP = 0.2
 """Longest time (s) between two messages over which rates are interpolated. If the rate changes by 10 rad/s²,
 the turn over such a gap is wrong by at most 3°."""

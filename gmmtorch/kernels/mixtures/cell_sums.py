@@ -234,9 +234,6 @@ def _corners(keys: Tensor) -> Tensor:
     return whole.double() - REACH
 
 
-# -- the twin -------------------------------------------------------------------------------------
-
-
 def _batched(views: DepthViews, side: float, max_cells: int) -> DepthCells | None:
     """The twin."""
     limits = zip(*(values.tolist() for values in _limits(views.pitch, side)), strict=True)

@@ -156,9 +156,6 @@ def _few_views(
     return gain.view(len(yaw), -1), taken.view(len(yaw), -1)
 
 
-# -- information of beams ----------------------------------------------------------------------------
-
-
 def first_block(occupancy: Tensor) -> Tensor:
     """The probability (..., C) that each cell is the first occupied one; the last must have occupancy 1."""
     return _reach(occupancy).mul_(occupancy)

@@ -71,9 +71,6 @@ def cast_components(
     return None if bool(failed) else (hits, misses)
 
 
-# -- draws of the twin -------------------------------------------------------------------------------
-
-
 def hidden_area(toward: Tensor, covariance: Tensor) -> Tensor:
     """Area (C,), m², that Gaussians hide from the sensor; `toward` (C, 3): from the sensor to the mean.
 

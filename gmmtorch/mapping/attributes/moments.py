@@ -207,9 +207,6 @@ def _joined(given: Sequence[Channel | None], sizes: Sequence[int]) -> Channel:
     return Numbers(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
-# -- learning --------------------------------------------------------------------------------------------
-
-
 def of_scans(scans: Sequence[Mapping[str, Tensor]], sizes: Sequence[int]) -> dict[str, Tensor]:
     """The channels (N, …) of the points of several scans together, unknown where a scan lacks one.
 
@@ -337,9 +334,6 @@ def _definite(matrices: Tensor) -> Tensor:
     """Symmetric matrices (K, A, A) without negative eigenvalues, which rounding can cause."""
     values, axes = torch.linalg.eigh((matrices + matrices.mT) / 2)
     return (axes * values.clamp_min(0)[:, None]) @ axes.mT
-
-
-# -- merging ---------------------------------------------------------------------------------------------
 
 
 def merged(

@@ -182,9 +182,6 @@ def _bounded(value: int, name: str, least: int, largest: int) -> int:
     return value
 
 
-# -- rounding --------------------------------------------------------------------------------------------
-
-
 def _number_steps(name: str, channel: Numbers, covariances: Tensor) -> Tensor:
     """Rows (K, n) of `number_model`: the share in eighths; steps and means (A), slopes (A, D)."""
     share = _share_steps(channel.share)

@@ -107,9 +107,6 @@ def first_tables(coarse: bool) -> ChanceTables:
     return first_chances(OF_COARSE if coarse else CHANCES, sizes)
 
 
-# -- the twin: the model ---------------------------------------------------------------------------------
-
-
 class _Walk:
     """Walks through the components of a batch, each value in place: written, or read into arrays of zeros.
 

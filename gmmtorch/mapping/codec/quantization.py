@@ -283,9 +283,6 @@ def joined(parts: Sequence[Components]) -> Components:
     )
 
 
-# -- order and numbers -----------------------------------------------------------------------------------
-
-
 def spatial_order(components: Components) -> Tensor:
     """An order (K,) of components by place, which saves log₂ K! bits in all, about a byte a component.
 
@@ -337,9 +334,6 @@ def _numbering(ids: Ints, by_place: Ints, robot: int, first: int) -> tuple[Ints,
     made[len(made) - len(by_place) :, 0] = robot
     made[len(made) - len(by_place) :, 1] = first + np.arange(len(by_place))
     return made, order
-
-
-# -- cells ----------------------------------------------------------------------------------------------
 
 
 def order_of(places: Lattice, rows: Ints | slice = slice(None)) -> Ints:

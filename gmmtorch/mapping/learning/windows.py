@@ -71,9 +71,6 @@ BeforeWindow = Callable[[Components, Sequence[Scan | DepthFrame]], None]
 """Is called with the components of a map before a window, and the window."""
 
 
-# -- an IncrementalRule ---------------------------------------------------------------------------------
-
-
 def absorb(
     components: Components,
     scans: Iterable[Scan | DepthFrame],
@@ -242,9 +239,6 @@ def keeps_components(rule: LearningRule) -> bool:
     origins is limited together with that of the new ones."""
     budgets = () if isinstance(rule, WindowedRule) else (rule.n_components, rule.max_bytes, rule.max_cost)
     return learns_in_parts(rule) and all(budget is None for budget in budgets)
-
-
-# -- a WindowedRule -------------------------------------------------------------------------------------
 
 
 def learn_window(scans: Sequence[Scan], rule: WindowedRule, generator: torch.Generator) -> Components:

@@ -188,8 +188,6 @@ class TiledMap:
             own = cutoff if len(self.index) else given  # without tiles the unfinished window counts, too
             self._recent._query_options = replace(self._recent._query_options, cutoff=own)
 
-    # -- learning -------------------------------------------------------------------------------------
-
     @property
     def n_pending(self) -> int:
         """Number of scans of the unfinished window, which are not in the files."""
@@ -318,8 +316,6 @@ class TiledMap:
         """Bytes of all files, the index included."""
         names = [INDEX] if self._recent is None else [INDEX, _recent_name(self._crc32)]
         return int(self.index.n_bytes.sum()) + sum((self.folder / name).stat().st_size for name in names)
-
-    # -- queries --------------------------------------------------------------------------------------
 
     def occupancy(
         self, points: ArrayLike, resolution: float | None = None, method: str | None = None

@@ -60,9 +60,6 @@ def expanded(parameters: Parameters, kind: str) -> Parameters:
     return parameters._replace(covariances=em.expand(parameters.covariances, kind, *parameters.means.shape))
 
 
-# -- log-densities --------------------------------------------------------------------------------
-
-
 class Factors:
     """Parameters with what their log-densities need: L⁻¹ in the shape of the type, and log-constants (K,).
 
@@ -225,9 +222,6 @@ def chunk_rows(points: Tensor) -> int:
 def in_chunks(points: Tensor, weight: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
     """Points (N, D) and their weights (N,), in chunks of `chunk_rows`."""
     return zip(points.split(chunk_rows(points)), weight.split(chunk_rows(points)), strict=True)
-
-
-# -- moments --------------------------------------------------------------------------------------
 
 
 class Sums:

@@ -117,9 +117,6 @@ def feature_dimension(n_features: int) -> int:
     return int(((8 * n_features + 1) ** 0.5 - 3) / 2 + 0.5)
 
 
-# -- covariance types -----------------------------------------------------------------------------
-
-
 COVARIANCE_TYPES = ("full", "tied", "diag", "spherical")
 """Those of scikit-learn: which covariances a mixture may have."""
 

@@ -198,9 +198,6 @@ def _ahead(
     return Steps(run)
 
 
-# -- stepwise EM ----------------------------------------------------------------------------------
-
-
 def blend(previous: Parameters, update: Parameters, step: float, kind: str = "full") -> Parameters:
     """The M-step on (1 − η) S + η s, η = `step`, where `previous` and `update` are the parameters of S and s.
 

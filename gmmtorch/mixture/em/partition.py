@@ -183,9 +183,6 @@ def _is_supported(
     return (count.amin(1) > 0) & ((count.amin(1) >= least) | is_outlier)
 
 
-# -- cells ----------------------------------------------------------------------------------------
-
-
 class Cells(NamedTuple):
     """features (C, F): mean feature of each cell; weight (C,): its points; member (N,): cell of each
     point.

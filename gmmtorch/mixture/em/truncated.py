@@ -57,9 +57,6 @@ class Settings:
     previous_bound: float = -math.inf
 
 
-# -- momentum -------------------------------------------------------------------------------------
-
-
 class Momentum:
     """M-steps on the statistics of the E-step plus a share of their last change (Nesterov's schedule).
 
@@ -105,9 +102,6 @@ class Momentum:
         assert self._em_step is not None
         self._last, self._age, self.is_extrapolated = None, 0, False
         return self._em_step
-
-
-# -- the loop -------------------------------------------------------------------------------------
 
 
 def run_truncated(
@@ -251,9 +245,6 @@ def _sample(rows: Rows, n: int) -> Tensor:
     return chosen.sort().values.to(rows.weight.device)
 
 
-# -- rows, grouped by their owner -----------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Rows:
     """Input of EM, in one frame, float64: points (N, D), or the mean features (N, F) of cells.
@@ -374,9 +365,6 @@ def choose_candidates(groups: Groups, parameters: Parameters, n_candidates: int)
 
     step = max(1, 4 * chunk_elements(groups.owner.device) // (n_samples * k))
     return torch.cat(list(chunked(k, step, chosen)))
-
-
-# -- the E-step over candidates -------------------------------------------------------------------
 
 
 def truncated_expectation(

@@ -169,9 +169,6 @@ def checked_noise(noise: Array | None, n: int, points: Tensor) -> Tensor:
     return noise
 
 
-# -- extreme deconvolution ------------------------------------------------------------------------
-
-
 class Block(NamedTuple):
     """Points (n, D) with weights (n,) and either one shared noise covariance (D, D) or one each (n, D, D)."""
 
@@ -269,9 +266,6 @@ def deconvolution_step(
     return step
 
 
-# -- one covariance for all points of a block -------------------------------------------------------
-
-
 def blurred(parameters: Parameters, noise: Tensor) -> Parameters:
     """The mixture of points with the noise covariance (D, D)."""
     return parameters._replace(covariances=parameters.covariances + noise)
@@ -301,9 +295,6 @@ def _symmetric(matrices: Tensor) -> Tensor:
     return (matrices + matrices.transpose(-2, -1)) / 2
 
 
-# -- a covariance for every point -------------------------------------------------------------------
-
-
 def _expectation_each(block: Block, parameters: Parameters) -> tuple[Tensor, Tensor]:
     """b and B of every pair with a share, summed by component; Σγ B = (Σγ R T⁻¹) Σ."""
     k, dim = parameters.means.shape
@@ -327,9 +318,6 @@ def _expectation_each(block: Block, parameters: Parameters) -> tuple[Tensor, Ten
     found, lost = sums.split([1 + dim + dim * dim, dim * dim], 1)
     remaining = _symmetric(lost.reshape(k, dim, dim) @ parameters.covariances)
     return torch.cat([found[:, : 1 + dim], found[:, 1 + dim :] + remaining.flatten(1)], 1), value
-
-
-# -- pairs of a noisy point and a component ---------------------------------------------------------
 
 
 class Pairs(NamedTuple):

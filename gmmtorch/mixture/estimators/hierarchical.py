@@ -108,8 +108,6 @@ class HierarchicalGaussianMixture(MixtureEstimator):
     random_state: RandomState = None
     dtype: str = "float32"
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def fit(
         self,
         X: Array,
@@ -143,8 +141,6 @@ class HierarchicalGaussianMixture(MixtureEstimator):
                 "and origins in fit."
             )
         return DensityLimit(self.min_density_share, self.sensor, checked_origins(origins, center) - center)
-
-    # -- the tree ---------------------------------------------------------------------------------
 
     def level(self, level: int) -> GaussianMixture:
         """The mixture of the nodes of a level (1 to `n_levels_`) and the leaves of earlier levels.

@@ -103,9 +103,6 @@ class RiemannianGaussianMixture(MixtureEstimator):
         self._store_fit(mixture, center, best.lower_bounds, best.converged)
 
 
-# -- the objective and its manifold ---------------------------------------------------------------
-
-
 class Frames(NamedTuple):
     """H_k in parts: H_k [x; 1] = A_k (x − μ_k) + b_k, with Aᵀb = 0, Σ⁻¹ = AᵀA and 1/s = ‖b‖².
 
@@ -245,9 +242,6 @@ def check_thickness(parameters: Parameters, points: Tensor) -> None:
             f"covariances[{int(thin.nonzero()[0])}] collapsed: its points do not span all dimensions; "
             "raise reg_covar (1e-6 m² is usual)."
         )
-
-
-# -- the ascent -----------------------------------------------------------------------------------
 
 
 Memory = deque[tuple[Tensor, Tensor, float]]

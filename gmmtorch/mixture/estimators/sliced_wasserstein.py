@@ -124,9 +124,6 @@ class SlicedWassersteinGaussianMixture(MixtureEstimator):
         self._store_fit(found, center, [-cost * unit**2 for cost in costs], converged)
 
 
-# -- the descent -----------------------------------------------------------------------------------
-
-
 class Shape(nn.Module):
     """A mixture as unconstrained parameters, zero at the start except the logits.
 
@@ -208,9 +205,6 @@ def differentiate(shape: Shape, slices: Slices, dtype: torch.dtype = torch.float
     shape.zero_grad()
     torch.autograd.backward([weights, along, deviations], [by_weight.mean(0), by_mean / n, by_deviation / n])
     return float(cost.mean())
-
-
-# -- optimal transport along lines ----------------------------------------------------------------
 
 
 class Slices(NamedTuple):

@@ -245,9 +245,6 @@ def _build_children(
     )
 
 
-# -- EM in the nodes of a level -------------------------------------------------------------------
-
-
 class Members(NamedTuple):
     """Assignment of points to nodes, in no order: point (R,), node (R,), weight (R,) float64."""
 
@@ -378,9 +375,6 @@ def maximization(
     return children, float(error)
 
 
-# -- start of EM ----------------------------------------------------------------------------------
-
-
 def principal_axes_start(packed: Packed, n_nodes: int, n_children: int, reg_covar: float) -> Children:
     """Start of EM: each node's members are cut into at most m pieces, with one component per piece.
 
@@ -470,9 +464,6 @@ def keep_children(children: Children, kept: Tensor) -> Children:
     largest = children.weights == children.weights.amax(1, keepdim=True)
     weights = torch.where(torch.where(kept.any(1, keepdim=True), kept, largest), children.weights, 0.0)
     return children._replace(weights=weights / weights.sum(1, keepdim=True))
-
-
-# -- assignment of members to children ------------------------------------------------------------
 
 
 Assignment = tuple[Members, Tensor, Tensor]

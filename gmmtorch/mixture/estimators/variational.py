@@ -141,8 +141,6 @@ class VariationalGaussianMixture(MixtureEstimator):
     verbose: int = 0
     verbose_interval: int = 10
 
-    # -- learning ---------------------------------------------------------------------------------
-
     def _learn(self, cloud: Cloud, on_iteration: OnIteration | None) -> None:
         prior, reg, generator = self._prior(cloud), float(self.reg_covar), as_generator(self.random_state)
         settings = self.n_components, reg, generator, self.covariance_type, self.n_init
@@ -226,8 +224,6 @@ class VariationalGaussianMixture(MixtureEstimator):
             center.new_tensor(dim if dof is None else float(dof)),
             spread,
         )
-
-    # -- the posterior ----------------------------------------------------------------------------
 
     def score_samples_predictive(self, X: Array) -> Array:
         """log p(x | X) of each point, (N,), nats, given all fitted points and the prior.

@@ -232,9 +232,6 @@ def _cut_triangles(panels: _Panels, ratio: Tensor) -> _Panels:
     return _Panels(panels.patch.repeat(4), base, torch.cat([half, half, half, -half], 1))
 
 
-# -- products of affine vectors at the nodes of a rule ------------------------------------------------
-
-
 def square_on(monomials: Tensor, start: Tensor, edges: Tensor) -> Tensor:
     """|start + Σ f_i edge_i|² at the nodes f of a rule with these `monomials`: (n, P)."""
     return product_on(monomials, start, start, edges)

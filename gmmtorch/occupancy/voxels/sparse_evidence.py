@@ -293,8 +293,6 @@ class SparseEvidence(SparseLattice):
     def _block_bytes(self) -> int:
         return 2 * self.counts.element_size() * self.cells_per_block
 
-    # -- adding -----------------------------------------------------------------------------------
-
     def add_rays(
         self,
         origins: ArrayLike,
@@ -409,8 +407,6 @@ class SparseEvidence(SparseLattice):
         self.keys, order = torch.sort(torch.cat([self.keys, new]))
         self._slots = torch.cat([self._slots, slots])[order]
 
-    # -- removing ---------------------------------------------------------------------------------
-
     def clear(self) -> None:
         """Remove all evidence; the box stays."""
         self.keys, self._slots = self.keys[:0], self._slots[:0]
@@ -446,8 +442,6 @@ class SparseEvidence(SparseLattice):
     def _corners(self) -> Tensor:
         """Lowest cell (B, D) of each block, in the order of `keys`."""
         return self.cells_at(self.keys, torch.zeros_like(self.keys))
-
-    # -- reading ----------------------------------------------------------------------------------
 
     def at_points(self, points: ArrayLike) -> tuple[Tensor, Tensor]:
         """Hits (M,) and misses (M,) of the cells that contain points (M, D), world metres.
@@ -501,8 +495,6 @@ class SparseEvidence(SparseLattice):
         """Lowest and highest corner (D,) of the stored blocks, world metres."""
         corner = self._corners()
         return corner.amin(0) * self.resolution, (corner.amax(0) + self.block_side) * self.resolution
-
-    # -- files ------------------------------------------------------------------------------------
 
     def in_key_order(self) -> tuple[Tensor, Tensor]:
         """Hits and misses (B, cells) of all blocks, in the order of `keys`."""
