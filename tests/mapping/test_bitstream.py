@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gmmtorch.errors import InvalidArgumentError
+from gmmtorch.errors import DataError, InvalidArgumentError
 from gmmtorch.mapping.codec.bitstream import BitReader, BitWriter, zigzag
 
 whole_numbers = st.lists(st.integers(-(2**59), 2**59) | st.integers(-9, 9), max_size=40)
@@ -59,12 +59,39 @@ def test_rice_codes_equal_those_by_hand():
     assert writer.to_bytes() == bytes([0b011_01_10_0])
 
 
+def test_golomb_codes_equal_those_by_hand():
+    """With 1 low bit, 9 has m = 9 // 2 + 1 = 5 = 1·01 in binary, so 0 0 1, then 01 and the low bit 1; 0 has
+    m = 1, so 1, then the low bit 0."""
+    writer = BitWriter()
+    writer.golomb(np.array([9, 0]), 1)
+    assert writer.to_bytes() == bytes([0b001_1_01_1_0])
+
+
+@given(values=st.lists(st.integers(0, 2**60) | st.integers(0, 9), min_size=1), low=st.integers(0, 20))
+def test_golomb_codes_are_decoded_also_beside_powers_of_two(values, low):
+    column = np.array([*values, 0, (1 << 53) - 1, 1 << 54, (1 << 60) - 1, (1 << 60) - (1 << low)], np.int64)
+    writer = BitWriter()
+    writer.golomb(column, low)
+    reader = BitReader(writer.to_bytes())
+    assert reader.golomb(len(column), low).tolist() == column.tolist()
+    reader.finish()
+
+
+@pytest.mark.parametrize("bits", ["0" * 70 + "1", "0" * 62 + "1" + "0" * 70, "0001"])
+def test_damaged_golomb_codes_are_refused(bits):
+    """A length beyond that of any number, and streams that end within one."""
+    data = np.packbits(np.array(list(bits), np.uint8)).tobytes()
+    with pytest.raises(DataError):
+        BitReader(data).golomb(1, 9)
+
+
 @pytest.mark.parametrize(
     ("values", "code"),
     [
         ([7] * 50, "fixed"),
         (list(range(1000, 1050)), "differences"),
-        ([0] * 40 + [1, 2, 0, 30], "rice"),
+        ([4, 0, 1, 9, 2, 6, 0, 3, 1, 12, 5, 2, 0, 7, 3, 1, 20, 4] * 3, "rice"),
+        ([0] * 40 + [1, 2, 0, 300], "golomb"),
         ([3, 0, 2, 1] * 12, "fixed"),
     ],
 )
@@ -72,7 +99,7 @@ def test_the_shortest_column_code_is_chosen(values, code):
     writer, width = BitWriter(), (max(values) - min(values)).bit_length()
     writer.column(np.array(values, np.int64))
     data = writer.to_bytes()
-    assert ("fixed", "rice", "differences")[BitReader(data).one(2)] == code
+    assert ("fixed", "rice", "differences", "golomb")[BitReader(data).one(2)] == code
     assert len(data) <= math.ceil((8 + 70 + width * len(values)) / 8)
 
 

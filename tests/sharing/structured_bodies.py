@@ -101,7 +101,8 @@ def _ids(writer: BitWriter, rng: Random, most: int = 12) -> int:
                 writer.one(0, 6)  # gaps of zero take one bit each
                 writer.fixed(np.ones(n - 1, np.int64), 1)
             else:
-                writer.rice_column(np.array([rng.randint(0, 5) for _ in range(n - 1)], np.int64))
+                largest = rng.choice([1, 5, 300])
+                writer.rice_column(np.array([rng.randint(0, 5) for _ in range(n - 2)] + [largest], np.int64))
         total += n
     return total
 
@@ -299,11 +300,10 @@ def _views(rng: Random) -> bytes:
 
 def _plan(rng: Random) -> bytes:
     writer = BitWriter()
-    for usual in (1, 7, 200):
-        _number(writer, rng, usual)
-    n = _number(writer, rng, rng.choice([_size(rng), 1000, 1001]))
-    n_views = _number(writer, rng, _size(rng))
-    _number(writer, rng, rng.choice([0, 5000]))
+    n, n_views = rng.choice([_size(rng), 1000, 1001]), _size(rng)
+    numbers = [_whole(rng, usual) for usual in (1, n, n_views, rng.choice([0, 5000]), 7, 200)]
+    writer.golomb(np.array(numbers, np.int64).clip(0, WIDE - 1), 2)
+    n, n_views = numbers[1:3]
     for _ in range(3 if n else 0):
         _number(writer, rng, rng.randrange(5000))
     if n:
@@ -322,7 +322,7 @@ def _moves(writer: BitWriter, rng: Random, n: int) -> None:
 
 def _announcement(rng: Random) -> bytes:
     writer = BitWriter()
-    for usual in (1, 2, 0, END - 1):
+    for usual in (1, 2, 0, rng.choice([-1, END - 1])):
         _number(writer, rng, usual)
     _intervals(writer, rng, 40)
     return writer.to_bytes()

@@ -434,8 +434,8 @@ def test_a_counts_message_equals_bytes_by_hand():
 def test_a_path_message_equals_bytes_by_hand():
     """Two poses of robot 0, a metre apart, the second turned right by 45°; no views."""
     poses = torch.tensor([[0.0, 0.01, 0.0, 0.0], [1.0, 0.01, 0.0, -math.pi / 4]], dtype=torch.float64)
-    # Robot 0, plan 1, poses 2 ms apart, 2 poses, no views; after 1 ms, and plan 1 is expected after 4 ms.
-    stream = "".join(f"{byte:08b}" for byte in (0, 2, 4, 4, 0, 5))
+    # Robot 0, 2 poses, no views; after 1 ms, 3 (zigzag 5) before plan 1 is expected; plan 1; 2 ms apart.
+    stream = "1 1 1 01 1 1".replace(" ", "") + "00 10 00 001 01 10".replace(" ", "")
     stream += "00000000" + "00000010" + "00000000" + "00000000"  # the first pose; 1 = 2 zigzag
     for low, moves in ((6, (200, 0)), (4, (0, 63))):  # 100 along x, -32 of 256 in yaw; zigzag
         stream += f"{low:06b}" + "".join("0" * (move >> low) + "1" for move in moves)

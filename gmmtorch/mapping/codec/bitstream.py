@@ -19,9 +19,12 @@ MAX_BYTES = 1 << 28
 """Largest length of a stream, about 25 million components. A reader expands every bit to a byte."""
 _BLOCK = 1 << 16  # numbers processed at a time; their bits take up to 24 bytes each
 _GROUP = 7  # bits in a group of a single number
-_FIXED, _RICE, _DIFFERENCES = range(3)
+_FIXED, _RICE, _DIFFERENCES, _GOLOMB = range(4)
 """Codes of a column: each number minus the smallest, in the width of the largest difference; the same in a
-Rice code; the first number, then differences, zigzag, in a Rice code."""
+Rice code; the first number, then differences, zigzag, in a Rice code; the numbers of the second in an
+exponential Golomb code."""
+_IS_GOLOMB = 63
+"""In place of the low bits of a Rice code: an exponential Golomb code follows."""
 
 
 def zigzag(values: Ints) -> Ints:
@@ -46,6 +49,8 @@ def _shortest_code(values: Ints) -> tuple[int, int, int]:
         return _FIXED, 0, base
     width, (low, n_bits), steps = extent.bit_length(), _rice_code(values - base), np.diff(values)
     found = [(width * float(len(values)), _FIXED, width, base), (n_bits, _RICE, low, base)]
+    low, n_bits = _golomb_code(values - base)
+    found.append((n_bits, _GOLOMB, low, base))
     # The reader limits this sum.
     if abs(float(values[0])) + float(np.abs(steps.astype(np.float64)).sum()) < 2.0**MAX_WIDTH:
         low, n_bits = _rice_code(zigzag(steps))
@@ -66,6 +71,24 @@ def _rice_code(values: Ints) -> tuple[int, float]:
     return lows[best], n_bits[best]
 
 
+def _golomb_code(values: Ints) -> tuple[int, float]:
+    """Low bits of the shortest exponential Golomb code of numbers (N,) ≥ 0, and its size in bits."""
+    if not len(values):
+        return 0, 0.0
+    about = int(np.log2(np.median(values) + 1))
+    lows = [max(about - less, 0) for less in (2, 1, 0)]
+    n_bits = [float((2.0 * _lengths(values, low) + low + 1).sum()) for low in lows]
+    best = int(np.argmin(n_bits))
+    return lows[best], n_bits[best]
+
+
+def _lengths(values: Ints, low: int) -> Ints:
+    """Bits of (n >> low) + 1 after the first, of numbers (N,) ≥ 0."""
+    whole = (values >> low) + 1
+    lengths: Ints = np.frexp(whole.astype(np.float64))[1].astype(np.int64) - 1
+    return lengths - (np.int64(1) << lengths > whole)  # float64 may round up to the next power of two
+
+
 class BitWriter:
     """Writes bits, most significant first."""
 
@@ -81,10 +104,15 @@ class BitWriter:
             )
         return data
 
-    def fixed(self, values: Ints, width: int) -> None:
-        """Writes each number ≥ 0 in `width` bits."""
+    def fixed(self, values: Ints, widths: Ints | int) -> None:
+        """Writes each number ≥ 0 in as many bits."""
         for begin in range(0, len(values), _BLOCK):
-            bits = values[begin : begin + _BLOCK, None] >> _shifts(width)
+            block = values[begin : begin + _BLOCK]
+            if isinstance(widths, int):
+                bits = block[:, None] >> _shifts(widths)
+            else:
+                width = widths[begin : begin + _BLOCK]
+                bits = np.repeat(block, width) >> _exponents(width)
             self._parts.append((bits & 1).astype(np.uint8).reshape(-1))
 
     def one(self, value: int, width: int) -> None:
@@ -95,11 +123,22 @@ class BitWriter:
     def rice(self, values: Ints, low: int) -> None:
         """Writes each number ≥ 0: the part above its `low` bits in unary (zeros, then a one); then all low
         bits."""
-        ends = np.cumsum((values >> low) + 1)
+        self._unary(values >> low)
+        self.fixed(values & ((np.int64(1) << low) - 1), low)
+
+    def golomb(self, values: Ints, low: int) -> None:
+        """Writes each number n ≥ 0: with m = (n >> low) + 1, how many bits m has after the first, in unary;
+        then for each number these bits and the `low` bits of n."""
+        lengths = _lengths(values, low)
+        self._unary(lengths)
+        self.fixed(values + (np.int64(1) << low) - (np.int64(1) << (lengths + low)), lengths + low)
+
+    def _unary(self, values: Ints) -> None:
+        """Writes each number ≥ 0 as so many zeros, then a one."""
+        ends = np.cumsum(values + 1)
         bits = np.zeros(int(ends[-1]) if len(ends) else 0, np.uint8)
         bits[ends - 1] = 1
         self._parts.append(bits)
-        self.fixed(values & ((np.int64(1) << low) - 1), low)
 
     def number(self, value: int) -> None:
         """Writes one whole number: zigzag, groups of 7 bits, lowest first, each after a bit for "more"."""
@@ -121,14 +160,22 @@ class BitWriter:
         self.number(base)
         if code == _FIXED:
             self.fixed(values - base, parameter)
+        elif code == _GOLOMB:
+            self.golomb(values - base, parameter)
         else:
             self.rice(zigzag(np.diff(values)) if code == _DIFFERENCES else values - base, parameter)
 
     def rice_column(self, values: Ints) -> None:
-        """Writes numbers ≥ 0 in a Rice code, after its low bits: at least one bit for each number."""
-        low, _ = _rice_code(values)
-        self.one(low, 6)
-        self.rice(values, low)
+        """Writes numbers ≥ 0 in a Rice or an exponential Golomb code, after its low bits: at least one bit
+        for each number."""
+        (low, n_bits), (other, n_other) = _rice_code(values), _golomb_code(values)
+        if n_other + 6 < n_bits:
+            self.one(_IS_GOLOMB, 6)
+            self.one(other, 6)
+            self.golomb(values, other)
+        else:
+            self.one(low, 6)
+            self.rice(values, low)
 
 
 class BitReader:
@@ -178,8 +225,7 @@ class BitReader:
             block = widths[begin : begin + _BLOCK]
             wide, ends = np.flatnonzero(block), np.cumsum(block)
             if len(wide):
-                exponents = np.repeat(ends, block) - 1 - np.arange(ends[-1])  # of the bits, highest first
-                bits = self._next(int(ends[-1])) << exponents
+                bits = self._next(int(ends[-1])) << _exponents(block)
                 values[begin + wide] = np.add.reduceat(bits, (ends - block)[wide])
         return values
 
@@ -210,19 +256,29 @@ class BitReader:
 
     def rice(self, n: int, low: Ints | int) -> Ints:
         """Reads n numbers ≥ 0."""
+        if n == 0:
+            return np.zeros(0, np.int64)
+        high = self._unary(n)
+        _check_width(int(np.max(low)) + int(high.max()).bit_length())
+        return (high << low) | self.fixed(n, low)
+
+    def golomb(self, n: int, low: int) -> Ints:
+        """Reads n numbers ≥ 0 in an exponential Golomb code."""
+        if n == 0:
+            return np.zeros(0, np.int64)
+        widths = self._unary(n) + low
+        _check_width(int(widths.max()) + 1)
+        return (np.int64(1) << widths) - (np.int64(1) << low) + self.fixed(n, widths)
+
+    def _unary(self, n: int) -> Ints:
+        """Reads n ≥ 1 numbers, each as so many zeros, then a one."""
         self.require(n)
         ones = np.flatnonzero(self._bits[self._at :])[:n]
         if len(ones) < n:
             raise DataError(f"{n:,} numbers are announced, {len(ones):,} are present: it is truncated.")
-        if n == 0:
-            return np.zeros(0, np.int64)
-        high = ones.copy()  # the number of zeros before each one
-        high[1:] -= ones[:-1] + 1
         self._at += int(ones[-1]) + 1
-        widest = int(np.max(low)) + int(high.max()).bit_length()
-        if widest > MAX_WIDTH:
-            raise DataError(f"A number has {widest} bits; at most {MAX_WIDTH} are read.")
-        return (high << low) | self.fixed(n, low)
+        ones[1:] -= ones[:-1] + 1
+        return ones
 
     def column(self, n: int) -> Ints:
         """Reads n whole numbers, |x| < 2⁶²."""
@@ -232,8 +288,8 @@ class BitReader:
             return _shifted_by(base, self.fixed(n, parameter))
         if code == _RICE:
             return _shifted_by(base, self.rice(n, parameter))
-        if code != _DIFFERENCES:
-            raise DataError(f"A column has the unknown code {code}: it is damaged.")
+        if code == _GOLOMB:
+            return _shifted_by(base, self.golomb(n, parameter))
         steps = np.append(np.int64(base), unzigzag(self.rice(max(n - 1, 0), parameter)))
         if float(np.abs(steps.astype(np.float64)).sum()) >= 2.0**MAX_WIDTH:
             raise DataError("The sum of a column's differences is too large: it is damaged.")
@@ -241,7 +297,8 @@ class BitReader:
 
     def rice_column(self, n: int) -> Ints:
         """Reads n numbers ≥ 0."""
-        return self.rice(n, self.one(6))
+        low = self.one(6)
+        return self.golomb(n, self.one(6)) if low == _IS_GOLOMB else self.rice(n, low)
 
     def scaled(self, scales: Ints) -> Ints:
         """Reads one whole number for each scale."""
@@ -259,6 +316,18 @@ def within(values: Ints, name: str, least: int, largest: int) -> Ints:
 def _shifts(width: int) -> Ints:
     """Exponents of the bits of a number of this width, highest first."""
     return np.arange(width - 1, -1, -1)
+
+
+def _exponents(widths: Ints) -> Ints:
+    """Exponents of all bits of numbers of these widths, highest first."""
+    ends = np.cumsum(widths)
+    exponents: Ints = np.repeat(ends, widths) - 1 - np.arange(ends[-1])
+    return exponents
+
+
+def _check_width(widest: int) -> None:
+    if widest > MAX_WIDTH:
+        raise DataError(f"A number has {widest} bits; at most {MAX_WIDTH} are read.")
 
 
 def _shifted_by(base: int, above: Ints) -> Ints:

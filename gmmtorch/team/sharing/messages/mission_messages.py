@@ -15,6 +15,7 @@ from gmmtorch.errors import DataError, InvalidArgumentError, check_whole
 from gmmtorch.mapping import BitReader, BitWriter, Ints, unzigzag, zigzag
 from gmmtorch.team.sharing.messages.datagrams import (
     FARTHEST,
+    LARGEST_NUMBER,
     MAX_BYTES,
     Kind,
     check_ids,
@@ -22,11 +23,9 @@ from gmmtorch.team.sharing.messages.datagrams import (
     make_datagram,
     read_intervals,
     read_keys,
-    read_number,
     split,
     write_intervals,
     write_keys,
-    write_number,
 )
 from gmmtorch.team.sharing.replica.record_keys import END, Intervals, ids_of, keys_of
 
@@ -121,6 +120,7 @@ TICKS, STAMP_TICKS = 1000, 1
 """Times of plans are whole milliseconds; stamps of views are whole seconds."""
 LATEST = 1e9
 """Latest time (s)."""
+_HEADER_NUMBERS, _HEADER_BITS = 6, 2  # of a plan, and low bits of their code: most are small
 _FARTHEST_STEP = FARTHEST * STEPS_PER_METRE
 _VALUE_SHIFT = 7  # lowest bits of a float16 that values of views leave out: they are rounded by up to 6 %
 _LARGEST_VALUE = 0x7BFF  # the bits of the largest float16
@@ -224,22 +224,23 @@ def encode_plan(
 
     Raises `InvalidArgumentError` if the plan does not fit into a datagram.
     """
-    writer = BitWriter()
-    write_number(writer, "sender", sender)
-    write_number(writer, "number", number)
+    for name, value in (("sender", sender), ("number", number)):
+        check_whole(name, value, 0, LARGEST_NUMBER)
     start, pace = (
         int(_ticks(name, torch.tensor([value], dtype=torch.float64))[0])
         for name, value in (("time", time), ("step", step))
     )
     if pace < 1:
         raise InvalidArgumentError(f"step={step} must be at least a millisecond.")
-    writer.number(pace)
     views = path[:0] if views is None else views
     for name, poses in (("path", path), ("views", views)):
         if len(poses) > MOST_POSES:
             raise InvalidArgumentError(f"{name} has {len(poses)} poses; {MOST_POSES} are the most.")
-        writer.number(len(poses))
-    writer.number(start - _expected(number, pace, len(path)))
+    late = start - _expected(number, pace, len(path))
+    header = np.array([sender, len(path), len(views), late, number, pace])
+    header[3:4] = zigzag(header[3:4])
+    writer = BitWriter()
+    writer.golomb(header, _HEADER_BITS)
     last = _write_path(writer, _pose_steps("path", path))
     _write_moves(writer, _moves(_coarse(np.concatenate([last, _pose_steps("views", views)])), VIEW_YAW_STEPS))
     datagram = make_datagram(Kind.PLAN, writer.to_bytes())
@@ -253,11 +254,15 @@ def encode_plan(
 
 def read_plan(body: bytes) -> PlanMessage:
     reader = BitReader(body)
-    sender, number = read_number(reader), read_number(reader)
-    pace, n_path, n_views = reader.number(), _read_size(reader), _read_size(reader)
+    header = reader.golomb(_HEADER_NUMBERS, _HEADER_BITS)
+    sender, n_path, n_views, _, number, pace = header.tolist()
+    if max(sender, number) > LARGEST_NUMBER:
+        raise DataError(f"Plan {number} of robot {sender}: {LARGEST_NUMBER} is the most. It is damaged.")
+    if max(n_path, n_views) > MOST_POSES:
+        raise DataError(f"{n_path} poses, {n_views} views; {MOST_POSES} are the most: it is damaged.")
     if not 0 < pace <= LATEST * TICKS:
         raise DataError(f"The poses of a path are {pace} ms apart: it is damaged.")
-    start = reader.number() + _expected(number, pace, n_path)
+    start = int(unzigzag(header[3:4])[0]) + _expected(number, pace, n_path)
     if abs(start) > LATEST * TICKS:
         raise DataError(f"A plan begins after {start} ms: it is damaged.")
     path = _read_path(reader, n_path)
@@ -272,13 +277,6 @@ def _expected(number: int, pace: int, n_poses: int) -> int:
     """When a plan begins (ms) if those before it took as long, and the first one began at 0."""
     expected = number * pace * n_poses
     return expected if expected <= LATEST * TICKS else 0
-
-
-def _read_size(reader: BitReader) -> int:
-    n = reader.number()
-    if not 0 <= n <= MOST_POSES:
-        raise DataError(f"{n} poses; {MOST_POSES} are the most: it is damaged.")
-    return n
 
 
 def quantized_values(values: Tensor) -> Tensor:

@@ -297,6 +297,9 @@ class AnnouncementMessage:
         return Intervals.span(self.begin, self.end)
 
 
+_TO_THE_LAST = -1  # in place of the length less one, of keys up to the last
+
+
 def encode_announcements(
     sender: int, incarnation: int, held: Intervals, max_bytes: int = MAX_BYTES, lowest: int = 0
 ) -> list[bytes]:
@@ -314,7 +317,7 @@ def encode_announcements(
         for name, value in (("sender", sender), ("incarnation", incarnation)):
             write_number(writer, name, value)
         writer.number(first)
-        writer.number(last - first)
+        writer.number(_TO_THE_LAST if end >= n else last - first)
         write_intervals(writer, Intervals(held.edges[2 * begin : 2 * end]), first)
         return make_datagram(Kind.ANNOUNCEMENT, writer.to_bytes())
 
@@ -325,9 +328,9 @@ def read_announcement(body: bytes) -> AnnouncementMessage:
     reader = BitReader(body)
     sender, incarnation = read_number(reader), read_number(reader)
     _check_sender(sender, incarnation)
-    begin = reader.number()
-    end = begin + reader.number() + 1
+    begin, length = reader.number(), reader.number()
     lowest = CHANNELS if begin < 0 else 0
+    end = lowest + END if length == _TO_THE_LAST else begin + length + 1
     if not lowest <= begin < end <= lowest + END:
         raise DataError(f"An announcement of the keys from {begin} to {end}: it is damaged.")
     held = read_intervals(reader, begin, end)
