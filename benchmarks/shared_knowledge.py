@@ -3,6 +3,7 @@
     python benchmarks/shared_knowledge.py                      # three robots in the warehouse, 150 s
     python benchmarks/shared_knowledge.py --world tunnels      # in a mine
     python benchmarks/shared_knowledge.py --figure known.png   # the picture of the table, too
+    python benchmarks/shared_knowledge.py --only replayed-lidar --data FOLDER   # with hall/ and street/
 
 A mission of E0 is recorded. Then the robots fly the same paths again, once for each way to share. A robot
 sends the beams that are novel to its map, and all robots, the sender too, learn only what the receivers of
@@ -14,6 +15,10 @@ contexts: the place of the child, which cells beside it its parent's neighbours 
 and the level. The chances are those of the whole mission, so an adaptive coder takes more. A count grid adds
 the number of beams of each cell, as a power of two, at its entropy. Draco codes the same points at an RMS
 error; a range image has every third or sixth pixel of a row and a column, in whole centimetres, with zstd.
+
+Real lidar is replayed as two robots with half of a recording each, which send mixtures, or octrees of whole
+scans or of the cells that neither has sent. A receiver has no more than what was sent, and is the best of
+three: a grid of the octree's cells, of twice these, and a map that learns from their centres.
 """
 
 from __future__ import annotations
@@ -21,8 +26,9 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +38,14 @@ from numpy.typing import NDArray
 from rate_distortion_figures import knowledge_figure
 from torch import Tensor
 
-from gmmtorch.experiments.harness import Case, Row, run
+from gmmtorch import GaussianMap, IncrementalRule
+from gmmtorch.experiments.evaluation.queries import hit_and_free, split_indices, test_beams
+from gmmtorch.experiments.harness import Case, Row, recording, run, score
+from gmmtorch.mapping.codec.quantization import quantized
+from gmmtorch.occupancy.occupancy_grid import OccupancyGrid
+from gmmtorch.occupancy.protocol import OccupancyMap
 from gmmtorch.report.style import save_figure
+from gmmtorch.scan import Scan
 from gmmtorch.simulation import DepthFrame
 from gmmtorch.team.exploration.mission.mission import Mission
 from gmmtorch.team.exploration.mission.options import FrameRule, TeamOptions, WorldOptions
@@ -42,6 +54,7 @@ from gmmtorch.team.exploration.robot.agent import Agent
 from gmmtorch.team.exploration.robot.mapper import FrameUpdate, GridMapper, novel_beams
 from gmmtorch.team.exploration.world.scoring import accuracy
 from gmmtorch.team.exploration.world.world import World
+from gmmtorch.team.sharing import Replica
 from gmmtorch.team.sharing.point_codecs import DepthImage, Draco, Octree, header, morton_codes
 
 Ints = NDArray[np.int64]
@@ -284,18 +297,89 @@ def measured(options: Any) -> Iterator[dict[str, Any]]:
             yield {"shared": ", ".join(filter(None, (name, code))), "kB": size / 1e3, **known}
 
 
-CASE = Case(
-    "shared-knowledge",
-    measure,
-    "Bytes of the map alone: no plans, views or announcements.",
-    {"kB": ".0f", "AUC": ".4f", "entropy taken away (kbit)": ".0f", "cells observed": ".3f"},
-    needs_data=False,
+def replayed_lidar(options: Any) -> Iterator[Row]:
+    """What two robots with halves of a recording know of each other's beams, held out, and for how much."""
+    torch.set_num_threads(1)
+    for name, share in (("hall", 1.0), ("street", 0.5)):
+        data = recording(options.data, name)
+        train, test = split_indices(int(share * len(data)), 5)
+        asked = hit_and_free(*test_beams([data[i] for i in test], 50_000, 0), "uniform", _LIDAR_CELL, 0)
+        scans, half = [data[i] for i in train], len(train) // 2
+        turns = list(zip_longest(scans[:half], scans[half:]))
+        size, known = _mixture_team(turns)
+        yield {"data": name, "shared": "mixture", "kB": size / 1e3, "AUC": score(known, asked, _LIDAR_CELL)}
+        for side, novel in itertools.product((0.1, 0.2), (False, True)):
+            cells, sent = _octree_team(turns, side, novel)
+            maps: list[OccupancyMap] = [
+                OccupancyGrid(side),
+                OccupancyGrid(2 * side),
+                GaussianMap(IncrementalRule()),
+            ]
+            for built, scan in itertools.product(maps, sent):
+                built.insert(scan)
+            auc = max(score(built, asked, _LIDAR_CELL) for built in maps)
+            what = f"octree, {side} m, {'new cells' if novel else 'whole scans'}, contexts"
+            yield {"data": name, "shared": what, "kB": cells.finish()["contexts"] / 1e3, "AUC": auc}
+
+
+def _mixture_team(turns: Sequence[tuple[Scan | None, ...]]) -> tuple[int, GaussianMap]:
+    """Bytes of all records that the two robots send, rounded as exploring robots do; their map."""
+    maps = [GaussianMap(IncrementalRule(), robot=robot) for robot in (0, 1)]
+    team, size = [Replica(robot, incarnation=0) for robot in (0, 1)], 0
+    for turn in [*turns, (None, None)]:
+        is_over = turn == (None, None)
+        for own, replica, scan in zip(maps, team, turn, strict=True):
+            if scan is not None:
+                own.insert(scan)
+            if is_over:
+                own.finish()
+            if not own.n_pending and own.dim is not None:
+                replica.publish(quantized(own.components(), coarse=True), whole=False)
+        for sender, receiver in (team, team[::-1]):
+            for datagram in sender.datagrams():
+                size += len(datagram)
+                assert receiver.receive(datagram)
+    return size, team[0].map()
+
+
+def _octree_team(
+    turns: Sequence[tuple[Scan | None, ...]], side: float, novel: bool
+) -> tuple[Cells, list[Scan]]:
+    """The octrees of all scans, without the cells that were sent before if `novel`; what receivers decode."""
+    cells, sent, known = Cells(side, False), [], np.zeros(0, np.int64)
+    for scan in (scan for turn in turns for scan in turn if scan is not None):
+        points = scan.points.double()
+        keys = _keys((points / side).floor().long().numpy() + (1 << 19))
+        new = ~np.isin(keys, known) if novel else np.ones(len(keys), np.bool_)
+        known = np.union1d(known, keys)
+        if new.any():
+            sent.append(Scan(cells.send(points[torch.from_numpy(new)], torch.zeros(0)), scan.origin))
+    return cells, sent
+
+
+_LIDAR_CELL = 0.2  # metres, of the cells that are asked about
+CASES = (
+    Case(
+        "shared-knowledge",
+        measure,
+        "Bytes of the map alone: no plans, views or announcements.",
+        {"kB": ".0f", "AUC": ".4f", "entropy taken away (kbit)": ".0f", "cells observed": ".3f"},
+        needs_data=False,
+    ),
+    Case(
+        "replayed-lidar",
+        replayed_lidar,
+        "Every fifth scan is held out.",
+        {"kB": ".1f", "AUC": ".4f"},
+        ("hall", "street"),
+        key=2,
+    ),
 )
 
 if __name__ == "__main__":
     run(
         __doc__ or "",
-        CASE,
+        *CASES,
         world={"default": "warehouse", "choices": ("warehouse", "tunnels")},
         duration={"type": float, "default": 150.0},
         seed={"type": int, "default": 0},
