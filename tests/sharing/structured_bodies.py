@@ -308,16 +308,16 @@ def _plan(rng: Random) -> bytes:
         _number(writer, rng, rng.randrange(5000))
     if n:
         writer.one(rng.randrange(256), 8)
-    _moves(writer, rng, min(n - 1, 1))
-    _moves(writer, rng, n - 2)
-    _moves(writer, rng, n_views)
+    _moves(writer, rng, min(n - 1, 1), (4, 3))
+    _moves(writer, rng, n - 2, (2, 0))
+    _moves(writer, rng, n_views, (3, 1))
     return writer.to_bytes()
 
 
-def _moves(writer: BitWriter, rng: Random, n: int) -> None:
-    for _ in range(2 if n > 0 else 0):
+def _moves(writer: BitWriter, rng: Random, n: int, lows: tuple[int, int]) -> None:
+    for low in lows if n > 0 else ():
         largest = rng.choice([9, 9, 9, 300, 1 << 33, 1 << 36, WIDE - 1])
-        writer.rice_column(np.array([rng.randint(0, largest) for _ in range(min(2 * n, 800))], np.int64))
+        writer.golomb(np.array([rng.randint(0, largest) for _ in range(min(2 * n, 800))], np.int64), low)
 
 
 def _announcement(rng: Random) -> bytes:

@@ -437,9 +437,9 @@ def test_a_path_message_equals_bytes_by_hand():
     # Robot 0, 2 poses, no views; after 1 ms, 3 (zigzag 5) before plan 1 is expected; plan 1; 2 ms apart.
     stream = "1 1 1 01 1 1".replace(" ", "") + "00 10 00 001 01 10".replace(" ", "")
     stream += "00000000" + "00000010" + "00000000" + "00000000"  # the first pose; 1 = 2 zigzag
-    for low, moves in ((6, (200, 0)), (4, (0, 63))):  # 100 along x, -32 of 256 in yaw; zigzag
-        stream += f"{low:06b}" + "".join("0" * (move >> low) + "1" for move in moves)
-        stream += "".join(f"{move % (1 << low):0{low}b}" for move in moves)
+    # 100 along x, zigzag 200 = 12·16 + 8, and 12 + 1 = 1·101; -32 of 256 in yaw, 63 = 7·8 + 7, 7 + 1 = 1·000.
+    stream += "0001" + "1" + "101_1000" + "0000" + "1" + "0001" + "000" + "000_111"
+    stream = stream.replace("_", "")
     stream += "0" * (-len(stream) % 8)
     datagram = sealed(b"\x29" + int(stream, 2).to_bytes(len(stream) // 8, "big"))
     assert encode_plan(0, 1, 0.001, 0.002, poses) == [datagram]

@@ -242,7 +242,8 @@ def encode_plan(
     writer = BitWriter()
     writer.golomb(header, _HEADER_BITS)
     last = _write_path(writer, _pose_steps("path", path))
-    _write_moves(writer, _moves(_coarse(np.concatenate([last, _pose_steps("views", views)])), VIEW_YAW_STEPS))
+    seen = _coarse(np.concatenate([last, _pose_steps("views", views)]))
+    _write_moves(writer, _moves(seen, VIEW_YAW_STEPS), _OF_VIEWS)
     datagram = make_datagram(Kind.PLAN, writer.to_bytes())
     if len(datagram) > MAX_BYTES:
         raise InvalidArgumentError(
@@ -267,7 +268,7 @@ def read_plan(body: bytes) -> PlanMessage:
         raise DataError(f"A plan begins after {start} ms: it is damaged.")
     path = _read_path(reader, n_path)
     last = _coarse(path[-1:] if n_path else np.zeros((1, 4), np.int64))
-    views = (last + np.cumsum(_read_moves(reader, n_views), 0)) * _COARSER
+    views = (last + np.cumsum(_read_moves(reader, n_views, _OF_VIEWS), 0)) * _COARSER
     reader.finish()
     seconds = start / TICKS, pace / TICKS
     return PlanMessage(sender, number, *seconds, _checked_poses(path), _checked_poses(views))
@@ -363,8 +364,8 @@ def _write_path(writer: BitWriter, steps: Ints) -> Ints:
         writer.number(value)
     writer.one(int(steps[0, 3]), _YAW_BITS)
     moves = _moves(steps)
-    _write_moves(writer, moves[:1])
-    _write_moves(writer, np.diff(moves, axis=0))
+    _write_moves(writer, moves[:1], _OF_FIRST)
+    _write_moves(writer, np.diff(moves, axis=0), _OF_LATER)
     return steps[-1:]
 
 
@@ -373,8 +374,8 @@ def _read_path(reader: BitReader, n: int) -> Ints:
     if not n:
         return np.zeros((0, 4), np.int64)
     first = np.array([[*(reader.number() for _ in range(3)), reader.one(_YAW_BITS)]], np.int64)
-    moves = np.cumsum([*_read_moves(reader, min(n - 1, 1)), *_read_moves(reader, max(n - 2, 0))], 0)
-    moves = moves.reshape(n - 1, 4)
+    begin = _read_moves(reader, min(n - 1, 1), _OF_FIRST)
+    moves = np.cumsum(np.concatenate([begin, _read_moves(reader, max(n - 2, 0), _OF_LATER)]), 0)
     return np.concatenate([first, first + np.cumsum(moves, 0)])
 
 
@@ -388,18 +389,20 @@ def _moves(steps: Ints, turn: int = YAW_STEPS) -> Ints:
 
 _AXES = slice(0, 2), slice(2, 4)
 """Moves along x and y are of one size, those along z and turns of another."""
+_OF_FIRST, _OF_LATER, _OF_VIEWS = (4, 3), (2, 0), (3, 1)
+"""Low bits of their codes: of a path's first move, of the differences of later ones, of moves to views."""
 
 
-def _write_moves(writer: BitWriter, moves: Ints) -> None:
-    for axes in _AXES if len(moves) else ():
-        writer.rice_column(zigzag(moves[:, axes].reshape(-1)))
+def _write_moves(writer: BitWriter, moves: Ints, lows: tuple[int, int]) -> None:
+    for axes, low in zip(_AXES, lows, strict=True):
+        writer.golomb(zigzag(moves[:, axes].reshape(-1)), low)
 
 
-def _read_moves(reader: BitReader, n: int) -> Ints:
+def _read_moves(reader: BitReader, n: int, lows: tuple[int, int]) -> Ints:
     """Moves (n, 4), of at least a bit for each number, so the data bound the memory."""
     moves = np.zeros((n, 4), np.int64)
-    for axes in _AXES if n else ():
-        moves[:, axes] = unzigzag(reader.rice_column(2 * n)).reshape(n, 2)
+    for axes, low in zip(_AXES, lows, strict=True):
+        moves[:, axes] = unzigzag(reader.golomb(2 * n, low)).reshape(n, 2)
     if n and int(np.abs(moves).max()) > 4 * _FARTHEST_STEP:
         raise DataError("A path leaves the world: it is damaged.")
     return moves
