@@ -18,6 +18,7 @@ from .evidence.point_evidence import GROUP as GROUP
 from .evidence.point_evidence import Lists as Lists
 from .evidence.point_evidence import PointTable as PointTable
 from .evidence.point_evidence import few_points_evidence as few_points_evidence
+from .evidence.point_evidence import glances as glances
 from .evidence.point_evidence import grouped_evidence as grouped_evidence
 from .evidence.point_evidence import listed_evidence as listed_evidence
 from .evidence.point_evidence import near_lists as near_lists

@@ -1,5 +1,5 @@
-// Vectors of numbers: `vec` has eight lanes on a CPU, one in each thread on CUDA; `mask`, `whole`, exp,
-// Mills' ratio.
+// Vectors of numbers: `vec` has eight lanes on a CPU, one in each thread on CUDA; `single` has as many in
+// single precision; `mask`, `whole`, exp, Mills' ratio.
 #pragma once
 
 #include "device.h"
@@ -16,12 +16,14 @@ struct OneLane {
     typedef double vec;
     typedef bool mask;
     typedef int64_t whole;
+    typedef float single;
     static constexpr int LANES = 1;
 };
 
 GMM_INLINE bool any(bool m) { return m; }
 GMM_INLINE unsigned bits(bool m) { return m; }
 GMM_INLINE double root(double x) { return sqrt(x); }
+GMM_INLINE float narrow(double x) { return (float)x; }
 GMM_INLINE double down(double x) { return floor(x); }
 GMM_INLINE double nearby(double x) { return rint(x); }
 GMM_INLINE double absolute(double x) { return fabs(x); }
@@ -31,6 +33,7 @@ GMM_INLINE double fused(double a, double b, double c) { return fma(a, b, c); }
 GMM_INLINE double get(double v, int) { return v; }
 GMM_INLINE int64_t get(int64_t v, int) { return v; }
 GMM_INLINE void set(double& v, int, double x) { v = x; }
+GMM_INLINE void set(float& v, int, float x) { v = x; }
 GMM_INLINE double largest(double v) { return v; }
 
 #if defined(GMM_VECTORS)
@@ -38,6 +41,7 @@ struct EightLanes {
     typedef double vec __attribute__((ext_vector_type(8)));
     typedef decltype(vec() < vec()) mask;
     typedef mask whole;
+    typedef float single __attribute__((ext_vector_type(8)));
     static constexpr int LANES = 8;
 };
 
@@ -48,6 +52,8 @@ typedef OneLane Lanes;
 
 typedef Lanes::vec vec;
 typedef Lanes::mask mask;
+typedef Lanes::single single;
+typedef decltype(single() < single()) single_mask;
 constexpr int LANES = Lanes::LANES;
 
 // Takes the lowest of some bits, and returns its number.
@@ -64,10 +70,14 @@ GMM_INLINE int take_lowest(unsigned& left) {
 
 #if defined(GMM_VECTORS)
 GMM_INLINE bool any(mask m) { return __builtin_reduce_or(m) != 0; }
+typedef bool flags __attribute__((ext_vector_type(8)));
 GMM_INLINE unsigned bits(mask m) {
-    typedef bool flags __attribute__((ext_vector_type(8)));
     return __builtin_bit_cast(unsigned char, __builtin_convertvector(m, flags));
 }
+GMM_INLINE unsigned bits(single_mask m) {
+    return __builtin_bit_cast(unsigned char, __builtin_convertvector(m, flags));
+}
+GMM_INLINE single narrow(vec x) { return __builtin_convertvector(x, single); }
 GMM_INLINE vec root(vec x) { return __builtin_elementwise_sqrt(x); }
 GMM_INLINE vec down(vec x) { return __builtin_elementwise_floor(x); }
 GMM_INLINE vec nearby(vec x) { return __builtin_elementwise_roundeven(x); }
@@ -78,6 +88,7 @@ GMM_INLINE double get(vec v, int i) { return v[i]; }
 GMM_INLINE int64_t get(Lanes::whole v, int i) { return v[i]; }
 // In memory: where a loop over lanes is not unrolled, v[i] = x would copy the whole vector for each lane.
 GMM_INLINE void set(vec& v, int i, double x) { ((double*)&v)[i] = x; }
+GMM_INLINE void set(single& v, int i, float x) { ((float*)&v)[i] = x; }
 
 GMM_INLINE double largest(vec v) {
     vec other = __builtin_shufflevector(v, v, 4, 5, 6, 7, 4, 5, 6, 7);
