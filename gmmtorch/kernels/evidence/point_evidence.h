@@ -25,8 +25,7 @@ GMM_INLINE vec sharpen(const vec* wide, vec* sharp) {
 // What the evidence of pairs of a point and a cone follows from. A pair is a lane of each vector.
 template <int DIM>
 struct Pairs {
-    vec y[DIM], z[DIM], sharp[DIM], squared, aa, bb, determinant, breadth, at_sensor;
-    vec log_scale, count, surface;
+    vec squared, aa, share, across, determinant, breadth, at_sensor, log_scale, count, surface;
 };
 
 // Sets what quick tests of a cone read, in single precision. With t = mean - s, the cutoff c and the largest
@@ -121,7 +120,7 @@ GMM_INLINE mask meeting(const double* cone, const vec* x, double h, double limit
         ray[j] = x[j] - origin[j];
         squared_distance += ray[j] * ray[j];
     }
-    vec *y = pairs.y, *z = pairs.z, *sharp = pairs.sharp, squared = (vec)(0.0);
+    vec y[DIM], z[DIM], sharp[DIM], squared = (vec)(0.0), across = squared;
     for (int j = 0; j < DIM; ++j) {
         y[j] = (vec)(0.0);
         for (int i = 0; i < DIM; ++i) y[j] += cone[i * DIM + j] * (x[i] - mean[i]);
@@ -145,7 +144,13 @@ GMM_INLINE mask meeting(const double* cone, const vec* x, double h, double limit
         extent = size > extent ? size : extent;
     }
     const mask at_sensor = extent <= 0.5 * h;
-    pairs.squared = squared, pairs.aa = aa, pairs.bb = bb, pairs.breadth = breadth;
+    const vec share = bb / aa;
+    for (int j = 0; j < DIM; ++j) {
+        const vec part = y[j] - share * z[j];
+        across += sharp[j] * part * part;
+    }
+    pairs.squared = squared, pairs.aa = aa, pairs.share = share, pairs.across = across;
+    pairs.breadth = breadth;
     pairs.at_sensor = at_sensor ? (vec)(1.0) : (vec)(0.0);
     pairs.log_scale = (vec)(rest[1]), pairs.count = (vec)(rest[2]), pairs.surface = (vec)(rest[3]);
     // Conservative: squares of differences lose digits, which the second term allows for.
@@ -157,8 +162,7 @@ GMM_INLINE mask meeting(const double* cone, const vec* x, double h, double limit
 // Hits and misses of pairs.
 template <int DIM>
 GMM_INLINE void evaluate(const Pairs<DIM>& pairs, double h, double limit, vec& hits, vec& misses) {
-    const vec *y = pairs.y, *z = pairs.z, *sharp = pairs.sharp;
-    const vec squared = pairs.squared, aa = pairs.aa, breadth = pairs.breadth;
+    const vec squared = pairs.squared, aa = pairs.aa, across = pairs.across, breadth = pairs.breadth;
     vec hit = (vec)(0.0);
     if (any(squared < limit)) {
         vec fade = limit - squared;
@@ -166,13 +170,8 @@ GMM_INLINE void evaluate(const Pairs<DIM>& pairs, double h, double limit, vec& h
         hit = expo(pairs.log_scale - 0.5 * squared) * fade;
         hit = hit > 1.0 ? (vec)(1.0) : hit;
     }
-    const vec length = root(aa), share = pairs.bb / aa;
-    vec across = (vec)(0.0);
-    for (int j = 0; j < DIM; ++j) {
-        const vec part = y[j] - share * z[j];
-        across += sharp[j] * part * part;
-    }
-    const vec along = share * length, leaving = along + 0.5 * h * length / breadth;
+    const vec length = root(aa);
+    const vec along = pairs.share * length, leaving = along + 0.5 * h * length / breadth;
     const vec beyond = leaving > 0.0 ? leaving : (vec)(0.0);
     vec fade = limit - across - beyond * beyond;
     fade = fade < 0.0 ? (vec)(0.0) : fade > 1.0 ? (vec)(1.0) : fade;
