@@ -88,9 +88,9 @@ GMM_KERNEL few_points_evidence(int64_t item, const int64_t* chosen, const double
                 for (int a = 0; a < DIM; ++a)
                     set(x[a], l, points[minimum(begin + l, n_points - 1) * DIM + a]);
             const double limit = cutoff * cutoff;
-            if (any(Quick<DIM>(cone, h, limit).passes(x))) {
-                Pairs<DIM> pairs;
-                const mask found = meeting<DIM>(cone, x, h, limit, pairs);
+            Pairs<DIM> pairs;
+            const mask found = meeting<DIM>(cone, x, h, limit, pairs);
+            if (any(found)) {
                 evaluate<DIM>(pairs, h, limit, hits, misses);
                 hits = found ? hits : (vec)(0.0), misses = found ? misses : (vec)(0.0);
             }

@@ -488,5 +488,7 @@ def _mixture_of(features: Tensor, weight: Tensor, dim: int, fit: SurfaceFit) -> 
     pieces = partition(means, weight, fit.flatness, *moments)
     smallest_variance = fit.noise**2
     first = maximization(pool(features, weight, pieces.labels, pieces.n_pieces), smallest_variance)
+    if not fit.iterations:
+        return first
     step = em_step(Rows(features, weight, are_points=False), smallest_variance, fit.dtype)
     return run_em(step, first, tol=_TOLERANCE, max_iter=fit.iterations).parameters

@@ -21,6 +21,7 @@ from gmmtorch.kernels import (
     GROUP,
     PointTable,
     chunked,
+    glances,
     grouped_evidence,
     is_fused,
     listed_evidence,
@@ -174,9 +175,13 @@ class PointForm:
         self.dim, self.cutoff = cones.dim, float(cutoff)
         safe_cholesky(cones.covariances.double().detach())  # raises if one is not positive definite
         axes = spectrum_of(cones.covariances)[1] if axes is None else axes
-        self._table = _table_of(cones, axes, self.resolution)
         self._share = share
+        self._set(_table_of(cones, axes, self.resolution))
+
+    def _set(self, table: PointTable) -> None:
+        self._table = table
         self._index: ConeIndex | Callable[[], ConeIndex] = self._new_index
+        self._glanced: Tensor | None = None  # of the fused kernel, once it is needed
 
     def _new_index(self) -> ConeIndex:
         return ConeIndex(self.rows, self.resolution, self.cutoff, smoothed=True, share=self._share)
@@ -199,20 +204,16 @@ class PointForm:
         new = cones.taken(is_new)
         safe_cholesky(new.covariances.double().detach())
         table = _table_of(new, spectrum_of(new.covariances)[1], self.resolution)
-        made._table = PointTable(
-            *(replaced_rows(rows, former, rest) for rows, rest in zip(self._table, table, strict=True))
-        )
+        pairs = zip(self._table, table, strict=True)
+        made._set(PointTable(*(replaced_rows(rows, former, rest) for rows, rest in pairs)))
         if isinstance(self._index, ConeIndex):
             made._index = functools.partial(self._index.replaced, made.rows, former)
-        else:
-            made._index = made._new_index
         return made
 
     def extended(self, other: PointForm) -> PointForm:
         """The form of these cones and, after them, those of another one, for cubes of the same side."""
         made, n = copy.copy(self), len(self.rows)
-        made._table = PointTable(*map(torch.cat, zip(self._table, other._table, strict=True)))
-        made._index = made._new_index
+        made._set(PointTable(*map(torch.cat, zip(self._table, other._table, strict=True))))
         if isinstance(self._index, ConeIndex):
             number = torch.arange(len(made.rows), device=made.rows.device)
             former = torch.where(number < n, number, -1)
@@ -255,7 +256,9 @@ class PointForm:
     def _added(self, points: PointGroups, found: PointEvidence) -> PointEvidence:
         """`found`, to which hits and misses at M points are added by the fused kernel."""
         every = points.points
-        settings = self.rows, self.resolution, self.cutoff, found
+        if self._glanced is None:
+            self._glanced = glances(self.rows, self.dim, self.resolution, self.cutoff)
+        settings = self.rows, self._glanced, self.resolution, self.cutoff, found
         if len(every) * len(self.rows) > _FEW_PAIRS:
             for rows, number in self.index.parts(every):
                 listed_evidence(every, rows, number, self.index.lists, *settings)

@@ -48,6 +48,23 @@ def test_fused_evidence_equals_the_twin(dim, kind, resolution, cutoff, monkeypat
         torch.testing.assert_close(other, one, rtol=1e-10, atol=float(bound))
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e4, 1e9])
+def test_quick_tests_in_single_precision_leave_out_no_evidence(dim, scale):
+    one = cones_of(dim, "any")
+    shifts = torch.tensor([3000.0, 0.0, -0.01], dtype=torch.float64).repeat(20)[:, None]
+    cones = one._replace(
+        means=(one.means + shifts) * scale,
+        covariances=one.covariances * scale**2,
+        origins=(one.origins + shifts) * scale,
+    )
+    places = points_of(one._replace(means=one.means + shifts, origins=one.origins + shifts))
+    form = PointForm(cones, 0.05 * scale, 3.0)
+    for found, other in zip(*by_both(lambda: form(places * scale)), strict=True):
+        assert torch.equal(found > 0, other > 0)
+        torch.testing.assert_close(found, other, rtol=1e-6, atol=1e-9 * float(cones.counts.sum()))
+
+
 @given(
     dim=st.sampled_from([2, 3]),
     kind=st.sampled_from(["any", "flat", "around"]),
