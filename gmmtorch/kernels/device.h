@@ -107,11 +107,9 @@ GMM_INLINE void reduce(const Squad& squad, int n, int left, Combine combine) {
 }
 
 // Starts to load n numbers.
-template <typename Number>
-GMM_INLINE void fetch(const Number* place, int n) {
+GMM_INLINE void fetch(const double* place, int n) {
 #if !defined(__CUDA_ARCH__)
-    for (int byte = 0; byte < n * (int)sizeof(Number); byte += 64)
-        __builtin_prefetch((const char*)place + byte);
+    for (int byte = 0; byte < n * 8; byte += 64) __builtin_prefetch((const char*)place + byte);
 #endif
 }
 

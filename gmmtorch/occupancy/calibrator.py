@@ -25,7 +25,6 @@ Reliability compares the predictions with what was seen: of the cells with θ = 
 from __future__ import annotations
 
 import base64
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -81,7 +80,8 @@ class Calibration(NamedTuple):
 
     def log_odds(self, hits: Tensor, misses: Tensor, side: float, dim: int) -> Tensor:
         """Log-odds of cubes of `side` (m) with hits and misses of any shape."""
-        weight, least, up, down = _numbers(self, side, dim)
+        found = _quantities(np.array(self.coefficients), np.array(side), self.length, dim)
+        weight, least, up, down = map(float, found)
         z = ((hits * weight + least) / (misses + least)).log()
         return down * z + (up - down) * (torch.nn.functional.softplus(z) - _HALF)
 
@@ -160,13 +160,6 @@ def _quantities(
     """w, n, and the slopes b above and below zero, for cubes of sides (m) of any shape."""
     a, density, up, down = np.exp(mean.reshape(4, 3) @ _powers(side / length))
     return a * length / side, density * side ** (dim - 1), up, down
-
-
-@functools.lru_cache(64)
-def _numbers(calibration: Calibration, side: float, dim: int) -> tuple[float, ...]:
-    """`_quantities` of cubes of one side (m)."""
-    found = _quantities(np.array(calibration.coefficients), np.array(side), calibration.length, dim)
-    return tuple(map(float, found))
 
 
 def _derivatives(

@@ -5,42 +5,6 @@
 
 namespace gmm {
 
-// What balls around x see of a cone: their rays from its sensor origin, and how much it is widened there.
-template <int DIM>
-struct Sight {
-    vec ray[DIM], distance, widened, beta;
-};
-
-// Whether the ray beyond x passes the mean, or ends before it, within the longest half axis of the
-// ellipsoid: a quick test, conservative except near the sensor origin. All of the ellipsoid lies within that
-// distance of the mean.
-template <int DIM>
-GMM_INLINE mask sees(const double* row, const vec* x, vec reach, double spread, double cutoff,
-                     Sight<DIM>& sight) {
-    const double *mean = row + DIM * DIM, *origin = mean + DIM, *variance = mean + 3 * DIM;
-    double mm = 0.0;
-    for (int j = 0; j < DIM; ++j) mm += (mean[j] - origin[j]) * (mean[j] - origin[j]);
-    const double whole = root(mm), longest = cutoff * root(maximum(variance[DIM - 1], 0.0));
-    vec along = (vec)(0.0), square = (vec)(0.0);
-    for (int j = 0; j < DIM; ++j) {
-        sight.ray[j] = x[j] - origin[j];
-        square += sight.ray[j] * sight.ray[j];
-        along += (mean[j] - origin[j]) * sight.ray[j];
-    }
-    const vec distance = root(square);
-    vec clear = distance - reach;
-    clear = clear < 1e-12 ? (vec)(1e-12) : clear;
-    const vec closeness = 1.0 / clear;
-    vec widened = whole * closeness;
-    widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
-    const vec far = whole + longest + widened, beta = far * reach * closeness;
-    const vec within = longest + widened + beta;
-    const vec over = square * (1.0 - 1e-14) > along ? square - along : (vec)(0.0);
-    sight.distance = distance, sight.widened = widened, sight.beta = beta;
-    return (distance <= far + reach)
-           & ((mm * (1.0 - 1e-14) - within * within) * square + over * over <= along * along);
-}
-
 // An item is a part of the lists of LANES balls. Sets for each entry of their lists whether it is near.
 template <int DIM>
 GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, const int32_t* entries,
@@ -69,19 +33,38 @@ GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, c
         for (int64_t at = from + part; at < starts[list + 1]; at += parts) {
             const double* row = rows + entries[at] * width;
             fetch(rows + entries[minimum(at + AHEAD * parts, starts[list + 1] - 1)] * width, READ);
-            const double *mean = row + DIM * DIM, *variance = mean + 3 * DIM;
-            double squares[DIM];
-            for (int j = 0; j < DIM; ++j) squares[j] = cutoff * cutoff * maximum(variance[j], 0.0);
-            Sight<DIM> sight;
-            mask close = sees<DIM>(row, x, reach, spread, cutoff, sight);
-            const vec widened = sight.widened * sight.widened, beta = sight.beta;
+            const double *mean = row + DIM * DIM, *origin = mean + DIM, *variance = mean + 3 * DIM;
+            double squares[DIM], mm = 0.0;
+            vec ray[DIM], along = (vec)(0.0), square = (vec)(0.0);
+            for (int j = 0; j < DIM; ++j) {
+                squares[j] = cutoff * cutoff * maximum(variance[j], 0.0);
+                mm += (mean[j] - origin[j]) * (mean[j] - origin[j]);
+                ray[j] = x[j] - origin[j];
+                square += ray[j] * ray[j];
+                along += (mean[j] - origin[j]) * ray[j];
+            }
+            // A quick test: the ray beyond x passes the mean, or ends before it, within the longest half axis
+            // of the ellipsoid.
+            const double whole = root(mm), longest = root(squares[DIM - 1]);
+            const vec distance = root(square);
+            vec clear = distance - reach;
+            clear = clear < 1e-12 ? (vec)(1e-12) : clear;
+            const vec closeness = 1.0 / clear;
+            vec widened = whole * closeness;
+            widened = spread * (widened < 1.0 ? (vec)(1.0) : widened);
+            const vec far = whole + longest + widened, beta = far * reach * closeness;
+            const vec within = longest + widened + beta;
+            const vec over = square * (1.0 - 1e-14) > along ? square - along : (vec)(0.0);
+            mask close = (mm * (1.0 - 1e-14) - within * within) * square + over * over <= along * along;
+            close &= distance <= far + reach;
+            widened *= widened;
             vec y[DIM], z[DIM];
             if (any(active & close)) {
                 for (int j = 0; j < DIM; ++j) {
                     y[j] = z[j] = (vec)(0.0);
                     for (int i = 0; i < DIM; ++i) {
                         y[j] += row[i * DIM + j] * (x[i] - mean[i]);
-                        z[j] += row[i * DIM + j] * sight.ray[i];
+                        z[j] += row[i * DIM + j] * ray[i];
                     }
                 }
             }
@@ -101,7 +84,7 @@ GMM_KERNEL near_lists(int64_t item, const double* rows, const int64_t* starts, c
                 aa = aa < 1e-300 ? (vec)(1e-300) : aa;
                 close &= cc - bb * bb / aa < 1.0 + 1e-6;
             }
-            close |= sight.distance <= (reach + cube_reach) * (1.0 + 1e-9);
+            close |= distance <= (reach + cube_reach) * (1.0 + 1e-9);
             const vec found = close ? (vec)(1.0) : (vec)(0.0);
             for (int l = first; l <= last; ++l) {
                 const double is_near = get(found, l);

@@ -30,12 +30,10 @@ struct Pairs {
 
 // Sets what quick tests of a cone read, in single precision. With t = mean - s, the cutoff c and the largest
 // variance v: s relative to the first mean, t, |t|^2, 1/|t|^2, W, B = c^2 (v + h^2/12) and L = c^2 h^2/12
-// |t|^2.
-//
-// If the cone gives evidence at x = s + u, then d^2 <= B + L/|u|^2, where d is the distance of the mean from
-// the nearest point p of the ray beyond x; and x is within d |u|/|p - s| of the segment from s to the mean.
-// Because of |t|^2 <= |p - s|^2 + d^2 this is at most the root of 9/8 (B + c^2 h^2/12), if |u|^2 is at least
-// 9 c^2 h^2/12; a nearer x is within |u|. So x is within W of the segment.
+// |t|^2. If the cone gives evidence at x = s + u, then d^2 <= B + L/|u|^2, where d is the distance of the
+// mean from the nearest point p of the ray beyond x; and x is within d |u|/|p - s| of the segment from s to
+// the mean. Because of |t|^2 <= |p - s|^2 + d^2 this is at most the root of 9/8 (B + c^2 h^2/12), if |u|^2 is
+// at least 9 c^2 h^2/12; a nearer x is within |u|. So x is within W of the segment.
 template <int DIM>
 GMM_KERNEL glance_at(int64_t item, const double* table, double resolution, double cutoff, float* glances) {
     const double* cone = table + item * (DIM * DIM + 5 * DIM + 4);
@@ -50,8 +48,8 @@ GMM_KERNEL glance_at(int64_t item, const double* table, double resolution, doubl
         seen += toward * toward;
     }
     const double limit = cutoff * cutoff, cube = resolution * resolution / 12.0;
-    const double widest = limit * variance[DIM - 1],
-                 reach = 1.125 * widest + (9.0 * limit + 3.0 * DIM) * cube;
+    const double widest = limit * variance[DIM - 1];
+    const double reach = 1.125 * widest + (9.0 * limit + 3.0 * DIM) * cube;
     const bool is_far = !(away + seen < 1e18);  // squares leave the range of the type: every point passes
     row[2 * DIM] = (float)seen;
     row[2 * DIM + 1] = (float)(1.0 / maximum(seen, 1e-30));
@@ -242,8 +240,8 @@ GMM_KERNEL grouped_evidence(int64_t item, const double* points, const int64_t* o
     const Squad squad = squad_of(item);
     const int64_t begin = squad.item * LANES * GROUP;
     const double* reference = table + DIM * DIM;
-    double x[LANES][PARTS * LANES][DIM], extent = 0.0;
-    single near_x[LANES][PARTS][DIM], center[DIM], reach = (single)(0.0f);
+    double extent = 0.0;
+    single x[LANES][PARTS][DIM], center[DIM], reach = (single)(0.0f);
     for (int l = 0; l < LANES; ++l) {
         const int64_t group = minimum(begin / GROUP + l, (n_points - 1) / GROUP);
         double middle[DIM], widest = 0.0, away = 0.0;
@@ -254,13 +252,12 @@ GMM_KERNEL grouped_evidence(int64_t item, const double* points, const int64_t* o
         }
         for (int i = 0; i < GROUP; ++i) {
             const double* point = points + order[minimum(group * GROUP + i, n_points - 1)] * DIM;
-            const int part = i / LANES, own = part / THREADS;
+            const int part = i / LANES;
             double square = 0.0;
             for (int a = 0; a < DIM; ++a) {
                 square += (point[a] - middle[a]) * (point[a] - middle[a]);
-                if (part % THREADS != squad.lane) continue;
-                x[l][own * LANES + i % LANES][a] = point[a];
-                set(near_x[l][own][a], i % LANES, (float)(point[a] - reference[a]));
+                if (part % THREADS == squad.lane)
+                    set(x[l][part / THREADS][a], i % LANES, (float)(point[a] - reference[a]));
             }
             widest = maximum(widest, square);
         }
@@ -285,13 +282,13 @@ GMM_KERNEL grouped_evidence(int64_t item, const double* points, const int64_t* o
             for (unsigned left = near[i]; left;) {
                 const int l = take_lowest(left);
                 for (int j = 0; j < PARTS; ++j) {
-                    unsigned found = glance.reaches(near_x[l][j]);
+                    unsigned found = glance.reaches(x[l][j]);
                     if (!found) continue;
                     const int64_t at = begin + l * GROUP + (squad.lane + j * THREADS) * LANES;
                     for (found &= first_bits(n_points - at); found;) {
-                        const int from = take_lowest(found);
-                        for (int a = 0; a < DIM; ++a) set(some[a], n, x[l][j * LANES + from][a]);
-                        numbers[n++] = order[at + from];
+                        const int64_t point = order[at + take_lowest(found)];
+                        for (int a = 0; a < DIM; ++a) set(some[a], n, points[point * DIM + a]);
+                        numbers[n++] = point;
                         if (n == LANES) held.take(cone, some, first_bits(n), numbers), n = 0;
                     }
                 }
@@ -332,7 +329,7 @@ GMM_KERNEL point_evidence(int64_t item, const double* points, const int64_t* ord
         const int64_t list = (int64_t)mine;
         for (int64_t entry = starts[list]; entry < starts[list + 1]; ++entry) {
             const int64_t cone = entries[entry], ahead = entries[minimum(entry + 6, starts[list + 1] - 1)];
-            fetch(glances + ahead * SHORT, SHORT);
+            fetch((const double*)(glances + ahead * SHORT), SHORT / 2);
             const Glance<DIM> glance(glances + cone * SHORT, resolution, extent);
             const unsigned passing = active & glance.reaches(near_x);
             if (passing) held.take(table + cone * WIDTH, x, passing, order + begin);
