@@ -36,6 +36,7 @@ NEVER = 1e4
 """Nats against a pose that is farther from the expected poses than the sensor moves."""
 _NEAR = 3  # cells from a surface: neither free nor unknown
 _LEVELS = 5  # the largest squares are 16 cells wide
+_BORDER = 96  # unknown cells around a raster: most points stay in it at all shifts
 _MOST_SQUARES = 150  # of one heading
 _TURNS = math.radians(0.7), math.radians(4)  # least and largest step between headings
 _FAR = 0.8  # quantile of the ranges that a step between headings moves by a cell
@@ -137,12 +138,14 @@ class PoseSearch:
             count_in_grid(misses, starts, ends, tuple(shape), low=self._low)
             crossed = (misses > 0).view(shape)
             raster = torch.where(crossed & (shade == 0), FREE, raster)
-        self._levels = [raster]
+        levels = [raster]
         for level in range(_LEVELS - 1):
             step = 1 << level
-            wide = torch.nn.functional.pad(self._levels[-1], (0, step, 0, step), value=UNKNOWN)
+            wide = torch.nn.functional.pad(levels[-1], (0, step, 0, step), value=UNKNOWN)
             wide = torch.maximum(wide[:-step], wide[step:])
-            self._levels.append(torch.maximum(wide[:, :-step], wide[:, step:]))
+            levels.append(torch.maximum(wide[:, :-step], wide[:, step:]))
+        self._levels = [_in_parts(one, 1 << level) for level, one in enumerate(levels)]
+        self._low -= _BORDER
 
     @classmethod
     def of_map(cls, components: Components, center: Tensor) -> PoseSearch:
@@ -162,10 +165,10 @@ class PoseSearch:
 
     def anywhere(self, points: Tensor, most: int) -> Found:
         """The best poses in the whole raster that differ, at most `most`; arguments as of `best`."""
-        size = self._levels[0].shape[:2]
+        size = self._levels[0].shape[2:]
         middle = self.cell * (self._low + torch.tensor(size).to(self._low) / 2)
         level = Pose(torch.eye(2).to(middle)[None], middle[None])
-        reach = self.cell * max(size) / math.sqrt(2)
+        reach = self.cell * (max(size) - 2 * _BORDER) / math.sqrt(2)
         unknown = Expectation(level, math.inf, math.inf, 1.0, reach)
         return self.best(points, unknown, most, _KEPT_ANYWHERE)
 
@@ -184,22 +187,22 @@ class PoseSearch:
         width = 1 << level
         n = math.ceil(expected.max_step / self.cell / width)
         side = torch.arange(-n, n + 1)
-        flat = (torch.cartesian_prod(side, side) * width).to(tried.cells)
+        flat = torch.cartesian_prod(side, side).to(tried.cells)
         n_turns = len(tried.angles)
         heading = torch.arange(n_turns, device=flat.device).repeat_interleave(len(flat))
         shift = flat.repeat(n_turns, 1)
         bound = self._scored(tried, heading, shift, level)
-        first = bound.topk(min(_FIRST, len(bound))).indices
+        first = _largest(bound, _FIRST)
         some, at, dived = heading[first], shift[first], bound[first]
         for finer in range(level - 1, -1, -1):
-            some, at = _divided(some, at, 1 << finer)
+            some, at = _divided(some, at)
             score = self._scored(tried, some, at, finer)
-            best = score.topk(min(_FIRST, len(score))).indices
+            best = _largest(score, _FIRST)
             some, at, dived = some[best], at[best], score[best]
-        least = float(dived[0])
+        least = float(dived.max())
         for finer in range(level - 1, -1, -1):
             rows = _most(bound, least - below, kept)
-            heading, shift = _divided(heading[rows], shift[rows], 1 << finer)
+            heading, shift = _divided(heading[rows], shift[rows])
             bound = self._scored(tried, heading, shift, finer)
         # Where more squares than `kept` may hold a better pose, the first ones may not be among them.
         heading, shift, bound = torch.cat([heading, some]), torch.cat([shift, at]), torch.cat([bound, dived])
@@ -221,17 +224,21 @@ class PoseSearch:
         return _Tried(expected, angles, turned, cells, off, len(points) / len(rows) / CORRELATED)
 
     def _scored(self, tried: _Tried, heading: Tensor, shift: Tensor, level: int) -> Tensor:
-        """Upper bounds (S,) of the scores in squares of poses, nats; the scores themselves on level 0."""
-        width, expected = 1 << level, tried.expected
+        """Upper bounds (S,) of the scores in squares of poses, nats; the scores themselves on level 0.
+
+        heading: (S,), in rising order. shift: (S, 2), in widths of a square of this level.
+        """
+        expected = tried.expected
         places = expected.poses.translation
         if is_fused(tried.cells, places, tried.off):
             prior = Prior(
-                places.contiguous(), tried.off.contiguous(), len(places), tried.share, self.cell, width,
+                places.contiguous(), tried.off.contiguous(), len(places), tried.share, self.cell,
                 expected.distance, expected.angle, expected.max_step, expected.max_turn + _ROUNDING,
                 _TAIL, NEVER,
             )  # fmt: skip
             return fused_bounds(tried.cells, heading, shift, self._levels[level], UNKNOWN, prior)
         sums = raster_sums(tried.cells, heading, shift, self._levels[level], UNKNOWN)
+        width = 1 << level
         away = (width - 1) * self.cell / math.sqrt(2)
         middles = self._middle(tried, shift, width)
         gap = (torch.cdist(middles, places) - away).clamp_min(0)
@@ -239,7 +246,7 @@ class PoseSearch:
 
     def _middle(self, tried: _Tried, shift: Tensor, width: int) -> Tensor:
         """The middle (S, 2) of squares, metres."""
-        cells = shift.double() + (width - 1) / 2
+        cells = width * shift.double() + (width - 1) / 2
         return tried.expected.poses[-1].translation + cells * self.cell
 
     def _told_apart(self, tried: _Tried, heading: Tensor, shift: Tensor, score: Tensor, most: int) -> Found:
@@ -278,9 +285,14 @@ def _firsts(rows: Tensor) -> Tensor:
 
 
 def _most(bound: Tensor, least: float, most: int) -> Tensor:
-    """Rows of the bounds above `least`, but of the `most` largest only."""
+    """Rows of the bounds above `least`, but of the `most` largest only; in rising order."""
     kept = (bound >= least).nonzero()[:, 0]
-    return kept if len(kept) <= most else kept[bound[kept].topk(most).indices]
+    return kept if len(kept) <= most else kept[_largest(bound[kept], most)]
+
+
+def _largest(bound: Tensor, most: int) -> Tensor:
+    """Rows of the `most` largest bounds, in rising order."""
+    return bound.topk(min(most, len(bound))).indices.sort().values
 
 
 def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor | None = None) -> Tensor:
@@ -294,7 +306,16 @@ def free_segments(origins: Tensor, ends: Tensor, is_empty: Tensor | None = None)
     return torch.stack([origins, origins + part * beams], 1)
 
 
-def _divided(heading: Tensor, shift: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """The four squares of `width` cells of each larger one."""
-    parts = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]], device=shift.device) * width
-    return heading.repeat_interleave(4), (shift[:, None] + parts).flatten(0, 1)
+def _divided(heading: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """The four squares of the next level in each square."""
+    parts = torch.tensor([[0, 0], [0, 1], [1, 0], [1, 1]], device=shift.device)
+    return heading.repeat_interleave(4), (2 * shift[:, None] + parts).flatten(0, 1)
+
+
+def _in_parts(raster: Tensor, width: int) -> Tensor:
+    """A raster with a border of unknown cells, as `raster_sums` takes it: neighbours in a part are `width`
+    cells apart."""
+    more = [-size % width for size in raster.shape]
+    padding = _BORDER, _BORDER + more[1], _BORDER, _BORDER + more[0]
+    wide = torch.nn.functional.pad(raster, padding, value=UNKNOWN)
+    return wide.unflatten(1, (-1, width)).unflatten(0, (-1, width)).permute(1, 3, 0, 2).contiguous()

@@ -44,7 +44,7 @@ def test_the_best_pose_is_that_of_all_placements(seed):
         for x in range(-5, 6):
             for y in range(-5, 6):
                 at = (placed + torch.tensor([x, y])).long()
-                sums = float(search._levels[0][at[:, 0], at[:, 1]].double().sum())
+                sums = float(search._levels[0][0, 0, at[:, 0], at[:, 1]].double().sum())
                 there = Pose(turned, center.translation + 0.25 * torch.tensor([x, y]).double())
                 score = sums * len(points) / len(rows) / CORRELATED
                 scores.append(score - float(expected.unlikely(there[None])))
@@ -71,7 +71,7 @@ def test_the_raster_of_a_map_knows_walls_free_space_and_what_is_behind():
     search = PoseSearch.of_map(made.components(), center)
     asked = torch.tensor([[1.5, 0.0], [3.0, 0.4], [3.0, -1.2], [3.8, 0.0]]).double() - center
     cells = ((asked / search.cell).floor() - search._low).long()
-    free, *walls, behind = search._levels[0][cells[:, 0], cells[:, 1]].tolist()
+    free, *walls, behind = search._levels[0][0, 0, cells[:, 0], cells[:, 1]].tolist()
     assert free == FREE
     assert min(walls) > UNKNOWN
     assert behind == UNKNOWN
@@ -97,21 +97,30 @@ def test_cells_that_beams_cross_are_free_and_others_are_unknown():
     search = PoseSearch(points, torch.tensor([[[0.0, 0.0], [1.5, 0.0]]]).double(), cell=0.1)
     asked = torch.tensor([[1.0, 0.0], [1.0, 2.0], [2.0, 3.0]]).double()
     cells = ((asked / 0.1).floor() - search._low).long()
-    value = search._levels[0][cells[:, 0], cells[:, 1]].tolist()
+    value = search._levels[0][0, 0, cells[:, 0], cells[:, 1]].tolist()
     assert value[:2] == [FREE, UNKNOWN]
     assert value[2] > UNKNOWN
 
 
-def test_fused_sums_over_a_raster_equal_the_twin():
+@pytest.mark.parametrize("width", [1, 4])
+@pytest.mark.parametrize("reach", [1, 5])
+def test_sums_over_a_raster_equal_those_of_a_loop_over_its_cells(width, reach):
     draw = torch.Generator().manual_seed(0)
-    cells = torch.randint(-3, 8, (3, 20, 2), generator=draw)
-    heading, shift = torch.randint(3, (50,), generator=draw), torch.randint(-4, 5, (50, 2), generator=draw)
-    raster = torch.randn(7, 9, generator=draw)
+    cells = torch.randint(-3, 8 * width, (3, 150, 2), generator=draw)
+    heading = torch.tensor([0] * 20 + [2] * 30)  # nothing has the second heading
+    shift = torch.randint(-reach, reach + 1, (50, 2), generator=draw)
+    raster = torch.randn(7 * width, 9 * width, generator=draw)
+    parts = raster.view(7, width, 9, width).permute(1, 3, 0, 2).contiguous()
     sums = []
+    for turn, (right, up) in zip(heading.tolist(), shift.tolist(), strict=True):
+        at = [(x + width * right, y + width * up) for x, y in cells[turn].tolist()]
+        sums.append(
+            sum(float(raster[x, y]) if 0 <= x < 7 * width and 0 <= y < 9 * width else 0.5 for x, y in at)
+        )
     for choice in ("torch", "fused"):
         with kernels(choice):
-            sums.append(raster_sums(cells, heading, shift, raster, 0.5))
-    torch.testing.assert_close(*sums)
+            found = raster_sums(cells, heading, shift, parts, 0.5)
+        torch.testing.assert_close(found, torch.tensor(sums).double())
 
 
 @pytest.mark.parametrize("level", [0, 2])
@@ -122,7 +131,7 @@ def test_fused_bounds_with_a_prior_equal_the_twin(level):
     tried = search._tried(
         torch.rand(90, 2, generator=draw).double(), Expectation(poses, 0.3, 0.2, 0.9, 1.0, 2.0)
     )
-    heading = torch.randint(len(tried.angles), (80,), generator=draw)
+    heading = torch.randint(len(tried.angles), (80,), generator=draw).sort().values
     shift = torch.randint(-30, 30, (80, 2), generator=draw)
     bounds = []
     for choice in ("torch", "fused"):

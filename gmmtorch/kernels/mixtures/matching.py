@@ -231,15 +231,15 @@ def alignment_scores(points: Tensor, motions: tuple[Tensor, Tensor], table: Alig
 
 
 _RASTER = FusedKernel("mixtures/point_alignment.h", "raster_sums")
-_NO_PRIOR = None, None, 0, *[0.0] * 9
+_NO_PRIOR = None, None, 0, *[0.0] * 8
 
 
 class Prior(NamedTuple):
     """Where a scan is expected, for `fused_bounds`.
 
     places: (B, 2), the last one that of the shift zero; metres. turned: (H, B), rad, from their headings to
-    those of the scan. distance, angle: standard deviations. share: of the sum. cell: metres. width: of a
-    square of placements, cells. max_step, max_turn: to the nearest place, at most, or `never` is subtracted.
+    those of the scan. distance, angle: standard deviations. share: of the sum. cell: metres. max_step,
+    max_turn: to the nearest place, at most, or `never` is subtracted.
     tail: see `localization.pose_search.Expectation.against`.
     """
 
@@ -248,7 +248,6 @@ class Prior(NamedTuple):
     n_places: int
     share: float
     cell: float
-    width: float
     distance: float
     angle: float
     max_step: float
@@ -261,16 +260,19 @@ def raster_sums(cells: Tensor, heading: Tensor, shift: Tensor, raster: Tensor, o
     """Sums (C,), float64, of a raster's values at the cells of a scan under C placements.
 
     Args:
-        cells: (H, N, 2) int64, of N points under each of H headings. heading: (C,) int64, and shift: (C, 2)
-            int64, of each placement. raster: (nx, ny) float32. outside: value of cells outside it.
+        cells: (H, N, 2) int64, of N points under each of H headings. heading: (C,) int64, in rising order,
+            and shift: (C, 2) int64, of each placement, in steps of W cells, a power of two. raster:
+            (W, W, nx, ny) float32, of which [x, y, i, j] is the value of the cell (W i + x, W j + y).
+            outside: value of cells outside it.
     """
     if is_fused(cells, heading, shift, raster):
         return fused_bounds(cells, heading, shift, raster, outside, _NO_PRIOR)
-    at = cells[heading] + shift[:, None]
-    size = torch.tensor(raster.shape, device=at.device)
+    width = raster.shape[0]
+    at, part = cells[heading].div(width, rounding_mode="floor") + shift[:, None], cells[heading] % width
+    size = torch.tensor(raster.shape[2:], device=at.device)
     is_inside = ((at >= 0) & (at < size)).all(2)
     x, y = at.clamp_min(0).minimum(size - 1).unbind(2)
-    return torch.where(is_inside, raster[x, y].double(), outside).sum(1)
+    return torch.where(is_inside, raster[part[:, :, 0], part[:, :, 1], x, y].double(), outside).sum(1)
 
 
 def fused_bounds(
@@ -283,8 +285,12 @@ def fused_bounds(
 ) -> Tensor:
     """`raster_sums` less the nats against placements by a prior. `localization.pose_search` has the twin."""
     sums = torch.empty(len(heading), dtype=torch.float64, device=cells.device)
-    given = cells, cells.shape[1], heading, shift, raster, *raster.shape
-    _RASTER(len(heading), *given, outside, *prior, sums)
+    n_headings, n_points, _ = cells.shape
+    level = len(raster).bit_length() - 1
+    first = torch.searchsorted(heading, torch.arange(n_headings + 1, device=cells.device))
+    _RASTER(
+        n_headings, cells, n_points, first, shift, raster, level, *raster.shape[2:], outside, *prior, sums
+    )
     return sums
 
 

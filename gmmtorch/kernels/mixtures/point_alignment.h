@@ -302,7 +302,6 @@ struct Expected {
     int64_t n;
     double share;
     double cell;
-    double width;
     double distance;
     double angle;
     double max_step;
@@ -311,42 +310,90 @@ struct Expected {
     double never;
 };
 
-GMM_INLINE double raster_value(const int64_t* cell, const int64_t* shift, const float* raster, int64_t nx,
-                               int64_t ny, double outside) {
-    const uint64_t x = cell[0] + shift[0], y = cell[1] + shift[1];
-    return x < (uint64_t)nx && y < (uint64_t)ny ? (double)raster[x * ny + y] : outside;
-}
+constexpr int LISTED = 128;  // points whose places in a raster are listed at a time
 
-// An item is a placement of the scan: a heading and a shift in whole cells. Without an expected place the
-// bound is the sum.
-GMM_KERNEL raster_sums(int64_t item, const int64_t* cells, int64_t n_points, const int64_t* heading,
-                       const int64_t* shift, const float* raster, int64_t nx, int64_t ny, double outside,
-                       Expected prior, double* bounds) {
-    const int64_t *cell = cells + heading[item] * n_points * 2, *at = shift + 2 * item;
-    double sums[4] = {0.0};  // which do not wait for each other
-    int64_t n = 0;
-    for (; n + 4 <= n_points; n += 4)
-        for (int i = 0; i < 4; ++i) sums[i] += raster_value(cell + 2 * (n + i), at, raster, nx, ny, outside);
-    for (; n < n_points; ++n) sums[0] += raster_value(cell + 2 * n, at, raster, nx, ny, outside);
-    const double sum = sums[0] + sums[1] + sums[2] + sums[3];
-    bounds[item] = sum;
-    if (!prior.n) return;
-    const double half = 0.5 * (prior.width - 1.0), away = (prior.width - 1.0) * prior.cell * sqrt(0.5);
-    double least = INFINITY;
-    bool is_near = false;
-    for (int64_t b = 0; b < prior.n; ++b) {
-        double square = 0.0;
+// An item is a heading, with the shifts from first[item] on, each in steps of a stride of 2^level cells.
+// The raster has stride × stride parts of nx × ny cells, so that a point under all shifts stays in one part.
+// Without an expected place a bound is the sum. Only points that some shifts take out of the raster are
+// looked for at each shift.
+GMM_KERNEL raster_sums(int64_t item, const int64_t* cells, int64_t n_points, const int64_t* first,
+                       const int64_t* shift, const float* raster, int64_t level, int64_t nx, int64_t ny,
+                       double outside, Expected prior, double* bounds) {
+    const int64_t begin = first[item], stop = first[item + 1];
+    if (begin == stop) return;
+    const int64_t stride = (int64_t)1 << level, size[2] = {nx, ny};
+    int64_t low[2] = {shift[2 * begin], shift[2 * begin + 1]}, high[2] = {low[0], low[1]};
+    for (int64_t at = begin; at < stop; ++at) {
+        bounds[at] = 0.0;
         for (int i = 0; i < 2; ++i) {
-            const double middle = prior.places[2 * prior.n - 2 + i] + (at[i] + half) * prior.cell;
-            square += (middle - prior.places[2 * b + i]) * (middle - prior.places[2 * b + i]);
+            low[i] = minimum(low[i], shift[2 * at + i]);
+            high[i] = maximum(high[i], shift[2 * at + i]);
         }
-        const double gap = maximum(sqrt(square) - away, 0.0), off = prior.turned[heading[item] * prior.n + b];
-        is_near = is_near || (gap <= prior.max_step && off <= prior.max_turn);
-        const double shifted = gap / prior.distance, turned = off / prior.angle;
-        least = minimum(least, shifted * shifted + turned * turned);
     }
-    bounds[item] = prior.share * sum - prior.tail * log(1.0 + least / (2.0 * prior.tail));
-    if (!is_near) bounds[item] -= prior.never;
+    for (int64_t from = 0; from < n_points; from += LISTED) {
+        int64_t inside[LISTED], edge[LISTED], at_edge[LISTED][2];
+        int n_inside = 0, n_edge = 0;
+        double away = 0.0;
+        for (int64_t n = from; n < n_points && n < from + LISTED; ++n) {
+            int64_t whole[2], part = 0;
+            bool is_inside = true, is_away = false;
+            for (int i = 0; i < 2; ++i) {
+                const int64_t cell = cells[(item * n_points + n) * 2 + i];
+                whole[i] = cell >> level;
+                part = (part << level) + (cell & (stride - 1));
+                is_inside = is_inside && whole[i] + low[i] >= 0 && whole[i] + high[i] < size[i];
+                is_away = is_away || whole[i] + high[i] < 0 || whole[i] + low[i] >= size[i];
+            }
+            const int64_t place = (part * nx + whole[0]) * ny + whole[1];
+            if (is_inside) {
+                inside[n_inside++] = place;
+            } else if (is_away) {
+                away += outside;
+            } else {
+                edge[n_edge] = place;
+                at_edge[n_edge][0] = whole[0];
+                at_edge[n_edge++][1] = whole[1];
+            }
+        }
+        for (int64_t at = begin; at < stop; ++at) {
+            const float* place = raster + (shift[2 * at] * ny + shift[2 * at + 1]);
+            double sums[4] = {away};  // which do not wait for each other
+            int n = 0;
+            for (; n + 4 <= n_inside; n += 4)
+                for (int i = 0; i < 4; ++i) sums[i] += (double)place[inside[n + i]];
+            for (; n < n_inside; ++n) sums[0] += (double)place[inside[n]];
+            for (n = 0; n < n_edge; ++n) {
+                const uint64_t x = at_edge[n][0] + shift[2 * at], y = at_edge[n][1] + shift[2 * at + 1];
+                sums[n & 3] += x < (uint64_t)nx && y < (uint64_t)ny ? (double)place[edge[n]] : outside;
+            }
+            bounds[at] += sums[0] + sums[1] + sums[2] + sums[3];
+        }
+    }
+    if (!prior.n) return;
+    const double width = (double)stride, half = 0.5 * (width - 1.0);
+    const double away = (width - 1.0) * prior.cell * sqrt(0.5);
+    const double *places = prior.places, *last = places + 2 * (prior.n - 1);
+    for (int64_t from = begin; from < stop; from += LANES) {
+        vec middle[2], sum, least = (vec)(1e300), is_near = (vec)(0.0);
+        for (int l = 0; l < LANES; ++l) {
+            const int64_t at = minimum(from + l, stop - 1);
+            set(sum, l, bounds[at]);
+            for (int i = 0; i < 2; ++i)
+                set(middle[i], l, last[i] + (width * (double)shift[2 * at + i] + half) * prior.cell);
+        }
+        for (int64_t b = 0; b < prior.n; ++b) {
+            const double off = prior.turned[item * prior.n + b], turned = off / prior.angle;
+            const vec x = middle[0] - places[2 * b], y = middle[1] - places[2 * b + 1];
+            vec gap = root(x * x + y * y) - away;
+            gap = gap > 0.0 ? gap : (vec)(0.0);
+            if (off <= prior.max_turn) is_near = gap <= prior.max_step ? (vec)(1.0) : is_near;
+            const vec shifted = gap / prior.distance, square = shifted * shifted + turned * turned;
+            least = square < least ? square : least;
+        }
+        vec bound = prior.share * sum - prior.tail * logarithm(1.0 + least / (2.0 * prior.tail));
+        bound = is_near > 0.0 ? bound : bound - prior.never;
+        for (int l = 0; l < LANES && from + l < stop; ++l) bounds[from + l] = get(bound, l);
+    }
 }
 
 }  // namespace gmm
