@@ -67,6 +67,7 @@ from .mixtures.matching import fused_bounds as fused_bounds
 from .mixtures.matching import fused_box_lists as fused_box_lists
 from .mixtures.matching import fused_registration as fused_registration
 from .mixtures.matching import raster_sums as raster_sums
+from .mixtures.matching import surface_rows as surface_rows
 from .mixtures.pair_merges import is_pair_merges_fused as is_pair_merges_fused
 from .mixtures.pair_merges import pair_merges as pair_merges
 from .mixtures.pair_merges import viewpoint_choice as viewpoint_choice

@@ -93,11 +93,11 @@ GMM_INLINE vec expo(vec x) {
     x = x > 700.0 ? (vec)(700.0) : x;
     const vec shifted = x * 1.4426950408889634 + 6755399441055744.0;  // n in its lowest bits
     const vec n = shifted - 6755399441055744.0;
-    const vec r = x - n * 0.693147180369123816490 - n * 1.90821492927058770002e-10;
+    const vec r = fused(n, (vec)(-1.90821492927058770002e-10), fused(n, (vec)(-0.693147180369123816490), x));
     const double factorials[12] = {39916800.0, 3628800.0, 362880.0, 40320.0, 5040.0, 720.0,
                                    120.0,      24.0,      6.0,      2.0,     1.0,    1.0};
     vec p = (vec)(1.0 / 479001600.0);
-    for (int i = 0; i < 12; ++i) p = p * r + 1.0 / factorials[i];
+    for (int i = 0; i < 12; ++i) p = fused(p, r, (vec)(1.0 / factorials[i]));
     const mask power = __builtin_bit_cast(mask, shifted) << 52;
     return __builtin_bit_cast(vec, __builtin_bit_cast(mask, p) + power);
 }
@@ -115,7 +115,7 @@ GMM_INLINE vec logarithm(vec x) {
 #endif
     const vec t = (part - 1.0) / (part + 1.0), tt = t * t;
     vec p = (vec)(1.0 / 21.0);
-    for (int i = 19; i >= 1; i -= 2) p = p * tt + 1.0 / i;
+    for (int i = 19; i >= 1; i -= 2) p = fused(p, tt, (vec)(1.0 / i));
     return power * 0.693147180559945309417 + 2.0 * t * p;
 }
 
@@ -129,14 +129,14 @@ GMM_INLINE vec arctangent(vec y, vec x) {
     const mask is_wide = small > 0.66 * large;  // beyond, the angle from 45 degrees
     const vec t = (is_wide ? small - large : small) / (is_wide ? small + large : large), z = t * t;
     vec p = (vec)(-0.8750608600031904122785), q = z + 24.85846490142306297962;
-    p = p * z - 16.15753718733365076637;
-    p = p * z - 75.00855792314704667340;
-    p = p * z - 122.8866684490136173410;
-    p = p * z - 64.85021904942025371773;
-    q = q * z + 165.0270098316988542046;
-    q = q * z + 432.8810604912902668951;
-    q = q * z + 485.3903996359136964868;
-    q = q * z + 194.5506571482613964425;
+    p = fused(p, z, (vec)(-16.15753718733365076637));
+    p = fused(p, z, (vec)(-75.00855792314704667340));
+    p = fused(p, z, (vec)(-122.8866684490136173410));
+    p = fused(p, z, (vec)(-64.85021904942025371773));
+    q = fused(q, z, (vec)(165.0270098316988542046));
+    q = fused(q, z, (vec)(432.8810604912902668951));
+    q = fused(q, z, (vec)(485.3903996359136964868));
+    q = fused(q, z, (vec)(194.5506571482613964425));
     vec angle = t + t * (z * p / q);
     angle = is_wide ? angle + 0.78539816339744830962 : angle;
     angle = is_steep ? 1.57079632679489661923 - angle : angle;

@@ -29,6 +29,7 @@ from gmmtorch.kernels import (
     fused_alignment,
     fused_box_lists,
     is_fused,
+    surface_rows,
 )
 from gmmtorch.mapping import Components
 from gmmtorch.mixture import Parameters, merge_components
@@ -91,9 +92,10 @@ class AlignmentTarget:
         normals = torch.zeros_like(means) if normals is None else normals.to(means)
         self.blur = blur
         lists = _near_lists(means, covariances, blur) if lists is None else lists
-        precisions = torch.linalg.inv(covariances).contiguous()  # else each sum would copy them
-        parts = means.contiguous(), precisions, normals.contiguous()
-        self.table = AlignmentTable(lists, *parts, blur, CUTOFF**2, _OUTLIERS, _OUTLIERS + _EXPLAINED)
+        parts = means, torch.linalg.inv(covariances), normals
+        self.table = AlignmentTable(
+            lists, *parts, surface_rows(*parts), blur, CUTOFF**2, _OUTLIERS, _OUTLIERS + _EXPLAINED
+        )
 
     def sums(self, points: Tensor, motions: Pose) -> AlignmentSums:
         """ℓ of points (N, D) under each motion, and its derivatives."""

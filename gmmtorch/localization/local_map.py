@@ -281,9 +281,10 @@ class LocalMap:
         motions, kept = starts.shifted(-self._center), len(starts)
         for target in targets:
             points = scan.points[: self.n_points if target is targets[-1] else _COARSE_POINTS]
+            images = range_images([points])
             found = align(points, target, motions, _STEPS)
             kept = max(kept // _EACH, _LAST)
-            total, view = self._total(found, points, expected)
+            total, view = self._total(found, points, expected, images)
             order = total.argsort(descending=True, stable=True)
             order = order[distinct(found.motions[order], target.blur / 2, target.blur / 2)]
             order = order[:kept]
@@ -291,7 +292,7 @@ class LocalMap:
             motions = found.motions
         # A climb has the points' score alone, which can rise along a wall while the sum of evidence falls.
         slid = align(points, targets[-1], _slid(found, points), _SLIDE_STEPS)
-        slid_total, slid_view = self._total(slid, points, expected)
+        slid_total, slid_view = self._total(slid, points, expected, images)
         # A place whose own direction stays open would lose to any pose of a wider search without a doubt.
         is_open = pose_covariance(slid.information, points)[1] > _LOOSEST
         slid_total = torch.where(is_open, -torch.inf, slid_total)
@@ -300,15 +301,17 @@ class LocalMap:
             found, total, view = slid.at(order), slid_total[order], slid_view.at(order)
         return self._judged(points, found, total, view, expected)
 
-    def _total(self, found: Alignment, points: Tensor, expected: Expectation) -> tuple[Tensor, View]:
+    def _total(
+        self, found: Alignment, points: Tensor, expected: Expectation, images: Images | None = None
+    ) -> tuple[Tensor, View]:
         """Log-likelihood of the points and of the motion (B,), nats; how the points agree with free space."""
         poses = found.motions.orthonormal().shifted(self._center)
-        seen, view = self._seen(points, poses)
+        seen, view = self._seen(points, poses, images)
         return found.evidence * len(points) / CORRELATED + seen - expected.unlikely(poses), view
 
-    def _seen(self, points: Tensor, poses: Pose) -> tuple[Tensor, View]:
+    def _seen(self, points: Tensor, poses: Pose, images: Images | None = None) -> tuple[Tensor, View]:
         """Log-likelihood (B,) of points in free space and of unseen ones, nats; and how many there are."""
-        view = self._space.view(points, poses)
+        view = self._space.view(points, poses, images)
         mean = _UNKNOWN * view.unknown - _CONTRADICTED * (view.in_free_space + view.looked_through)
         return mean * len(points) / CORRELATED, view
 
@@ -419,41 +422,48 @@ class FreeSpace:
     """
 
     def __init__(self, points: Sequence[Tensor], poses: Pose) -> None:
-        images = zip(*map(range_image, points), strict=True)
-        self._nearest, self._farthest = map(torch.stack, images)
+        self._images = range_images(points)
         self._inverse = poses.inverse()
         some = [one[:: math.ceil(len(one) / _KEPT_POINTS) or 1] for one in points]
         self._points = torch.cat([poses[row].apply(part) for row, part in enumerate(some)])
 
-    def view(self, points: Tensor, poses: Pose) -> View:
-        """How a scan's points (N, D) agree with the space that was seen, at poses (B)."""
-        free, unknown = _counted(points, poses, (self._nearest, self._farthest), self._inverse)
-        nearest, farthest = range_image(points)
+    def view(self, points: Tensor, poses: Pose, images: Images | None = None) -> View:
+        """How a scan's points (N, D) agree with the space that was seen, at poses (B). images: of the scan;
+        None: they are made."""
+        free, unknown = _counted(points, poses, self._images, self._inverse)
         still = Pose.identity(poses.dim, 1, device=points.device)
-        through, hidden = _counted(self._points, poses.inverse(), (nearest[None], farthest[None]), still)
+        images = range_images([points]) if images is None else images
+        through, hidden = _counted(self._points, poses.inverse(), images, still)
         share = through / (len(self._points) - hidden).clamp_min(_KEPT_POINTS // 4)
         return View(free / len(points), unknown / len(points), share)
 
 
-def range_image(points: Tensor) -> tuple[Tensor, Tensor]:
-    """The nearest return (C,) around each direction, and the farthest in it; infinity and zero without."""
-    dim = points.shape[1]
-    cells, distance = _cells(points)
+Images = tuple[Tensor, Tensor]
+"""The nearest return (K, C) around each direction, in K scans, and the farthest in it; infinity and zero
+without."""
+
+
+def range_images(points: Sequence[Tensor]) -> Images:
+    """Of some scans (N, D), in the frame of the sensor."""
+    dim, n = points[0].shape[1], len(points)
+    cells, distance = _cells(torch.cat(list(points)))
     across, high = _size(dim)
-    nearest = torch.full((across * high,), math.inf).to(points).scatter_reduce(0, cells, distance, "amin")
-    farthest = torch.zeros(across * high).to(points).scatter_reduce(0, cells, distance, "amax")
-    sides = nearest.view(high, across)
-    sides = torch.minimum(sides, torch.minimum(sides.roll(1, 1), sides.roll(-1, 1)))
+    scan = torch.arange(n, device=cells.device).repeat_interleave(
+        torch.tensor([len(part) for part in points], device=cells.device), output_size=len(cells)
+    )
+    cells = cells + scan * (across * high)
+    nearest = torch.full((n * across * high,), math.inf).to(distance)
+    nearest = nearest.scatter_reduce(0, cells, distance, "amin").view(n, high, across)
+    farthest = torch.zeros(n * across * high).to(distance).scatter_reduce(0, cells, distance, "amax")
+    sides = torch.minimum(nearest, torch.minimum(nearest.roll(1, 2), nearest.roll(-1, 2)))
     if dim == 3:
-        up = torch.nn.functional.pad(sides[None, None], (0, 0, 1, 1), value=math.inf)[0, 0]
-        sides = torch.minimum(sides, torch.minimum(up[2:], up[:-2]))
-    around = torch.where(farthest > 0, sides.flatten(), math.inf)
-    return around, farthest
+        up = torch.nn.functional.pad(sides, (0, 0, 1, 1), value=math.inf)
+        sides = torch.minimum(sides, torch.minimum(up[:, 2:], up[:, :-2]))
+    farthest = farthest.view(n, -1)
+    return torch.where(farthest > 0, sides.flatten(1), math.inf), farthest
 
 
-def _counted(
-    points: Tensor, motions: Pose, images: tuple[Tensor, Tensor], frames: Pose
-) -> tuple[Tensor, Tensor]:
+def _counted(points: Tensor, motions: Pose, images: Images, frames: Pose) -> tuple[Tensor, Tensor]:
     """Numbers (B,) of points (N, D) under each motion in front of the surface of any of K range images
     (K, C), and of those that no image shows. frames: (K), image ← world."""
     if is_fused(points, *motions.parts, *images, *frames.parts):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gmmtorch.localization.local_map import FreeSpace
+from gmmtorch.localization.local_map import FreeSpace, range_images
 from gmmtorch.pose import Pose
 
 HALF = 4.0  # metres from the centre of the room to a wall
@@ -65,3 +65,16 @@ def test_shares_do_not_depend_on_the_frame_of_the_world():
     other = FreeSpace([room(2, torch.zeros(2).double())], there).view(scan, there @ poses)
     for a, b in zip(one, other, strict=True):
         assert torch.allclose(a, b, atol=0.01)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_an_image_is_that_of_its_scan_alone(dim):
+    scans = [
+        room(dim, torch.full((dim,), shift).double())[:n] for shift, n in ((0.0, 300), (0.2, 1), (-0.3, 90))
+    ]
+    for row, scan in enumerate(scans):
+        (nearest,), (farthest,) = range_images([scan])
+        assert torch.equal(range_images(scans)[0][row], nearest)
+        assert torch.equal(range_images(scans)[1][row], farthest)
+        assert float(farthest.max()) == float(scan.norm(dim=1).max())
+        assert float(nearest.min()) == float(scan.norm(dim=1).min())

@@ -171,19 +171,28 @@ class AlignmentTable(NamedTuple):
     """K surfaces with which a scan is aligned.
 
     lists: of the components near each cell. means (K, D), precisions (K, D, D), and normals (K, D), zero for
-    those that are seen from all sides. behind: metres behind a component's face from which on the sensor does
-    not see it. farthest: d² beyond which a component is left out. outliers: ε. explained: ε + q, above which
-    a point counts as explained.
+    those that are seen from all sides. rows: `surface_rows` of these. behind: metres behind a component's
+    face from which on the sensor does not see it. farthest: d² beyond which a component is left out.
+    outliers: ε. explained: ε + q, above which a point counts as explained.
     """
 
     lists: NearLists
     means: Tensor
     precisions: Tensor
     normals: Tensor
+    rows: Tensor
     behind: float
     farthest: float
     outliers: float
     explained: float
+
+
+def surface_rows(means: Tensor, precisions: Tensor, normals: Tensor) -> Tensor:
+    """A row for each surface, as the kernels read it: its mean, its normal, the upper triangle of its
+    precision, and zeros up to a whole number of quadruples."""
+    upper = torch.triu_indices(*precisions.shape[1:], device=means.device)
+    rows = torch.cat([means, normals, precisions[:, upper[0], upper[1]]], 1)
+    return torch.nn.functional.pad(rows, (0, -rows.shape[1] % 4))
 
 
 def alignment_sums(points: Tensor, motions: tuple[Tensor, Tensor], table: AlignmentTable) -> AlignmentSums:
@@ -208,7 +217,7 @@ def fused_alignment(
     space = points.new_empty(n * (width + n_parts * n_sums))
     team = Team.of(points.device)
     _ALIGNMENTS[dim](
-        team.n, *team, points, len(points), n_parts, n, *motions, *table.lists, *table[1:],
+        team.n, *team, points, len(points), n_parts, n, *motions, *table.lists, *table[4:],
         settled, max_steps, space,
     )  # fmt: skip
     rows = space[: n * width].view(n, width)[:, : sum(parts)]
@@ -226,7 +235,7 @@ def alignment_scores(points: Tensor, motions: tuple[Tensor, Tensor], table: Alig
         parts = [tuple(part[some] for part in motions) for some in rows]
         return torch.cat([_batched_alignment(points, (turn, shift), table).score for turn, shift in parts])
     scores = points.new_empty(n)
-    _SCORES[dim](n, points, len(points), *motions, *table.lists, *table[1:], scores)
+    _SCORES[dim](n, points, len(points), *motions, *table.lists, *table[4:], scores)
     return scores
 
 
@@ -299,7 +308,7 @@ def _batched_alignment(
 ) -> AlignmentSums:
     """The twin."""
     rotations, translations = motions
-    lists, means, precisions, normals, behind, farthest, outliers, explained = table
+    lists, means, precisions, normals, _, behind, farthest, outliers, explained = table
     n, (count, dim) = len(translations), points.shape
     lever = (points @ rotations.mT).flatten(0, 1)
     moved = lever + translations.repeat_interleave(count, 0)

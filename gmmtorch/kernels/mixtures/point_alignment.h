@@ -16,9 +16,7 @@ struct Aligned {
     const int64_t* shape;
     const int64_t* starts;
     const int32_t* entries;
-    const double* means;
-    const double* precisions;
-    const double* normals;
+    const double* surfaces;
     double behind;
     double farthest;
     double outliers;
@@ -63,6 +61,38 @@ GMM_KERNEL box_lists(int64_t item, Team team, const int64_t* first, const int64_
     if (item == 0) starts[0] = 0;
 }
 
+// Numbers of a surface: its mean, its normal, the upper triangle of its precision, and zeros up to a whole
+// number of quadruples.
+CUDA_CALLABLE constexpr int n_of_surface(int dim) { return (2 * dim + dim * (dim + 1) / 2 + 3) / 4 * 4; }
+
+// The numbers of the row of each lane, where N is a multiple of four.
+template <int N>
+GMM_INLINE void load_rows(const double* rows, const int64_t* row, vec* numbers) {
+#if defined(GMM_VECTORS)
+    typedef double quad __attribute__((ext_vector_type(4)));
+    typedef double packed __attribute__((ext_vector_type(4), aligned(8)));
+    for (int n = 0; n < N; n += 4) {
+        quad column[2][4];
+        for (int half = 0; half < 2; ++half) {  // the transpose of four rows
+            quad given[4];
+            for (int l = 0; l < 4; ++l) given[l] = *(const packed*)(rows + row[4 * half + l] * N + n);
+            const quad a = __builtin_shufflevector(given[0], given[1], 0, 4, 2, 6);
+            const quad b = __builtin_shufflevector(given[0], given[1], 1, 5, 3, 7);
+            const quad c = __builtin_shufflevector(given[2], given[3], 0, 4, 2, 6);
+            const quad d = __builtin_shufflevector(given[2], given[3], 1, 5, 3, 7);
+            column[half][0] = __builtin_shufflevector(a, c, 0, 1, 4, 5);
+            column[half][1] = __builtin_shufflevector(b, d, 0, 1, 4, 5);
+            column[half][2] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
+            column[half][3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
+        }
+        for (int i = 0; i < 4; ++i)
+            numbers[n + i] = __builtin_shufflevector(column[0][i], column[1][i], 0, 1, 2, 3, 4, 5, 6, 7);
+    }
+#else
+    for (int n = 0; n < N; ++n) numbers[n] = rows[row[0] * N + n];
+#endif
+}
+
 CUDA_CALLABLE constexpr int n_alignment_sums(int dim) { return 2 + n_free(dim) * (n_free(dim) + 2); }
 
 // Sums over the points begin … stop - 1 under one motion: log(1 + q/outliers), whether q is above the height
@@ -73,6 +103,7 @@ GMM_INLINE void point_sums(const double* pose, const double* points, int64_t beg
                            const Aligned& target, double* sums) {
     const double* shift = pose + DIM * DIM;
     constexpr int TURNS = n_free(DIM) - DIM, N_SUMS = DERIVES ? n_alignment_sums(DIM) : 1;
+    constexpr int N_NUMBERS = n_of_surface(DIM);
     vec sum[N_SUMS];
     for (int s = 0; s < N_SUMS; ++s) sum[s] = (vec)(0.0);
     for (int64_t n = begin; n < stop; n += LANES) {
@@ -85,7 +116,7 @@ GMM_INLINE void point_sums(const double* pose, const double* points, int64_t beg
                     set(x[j], lane, points[minimum(n + lane, stop - 1) * DIM + j]);
             }
             l[i] = pull[i] = (vec)(0.0);
-            for (int j = 0; j < DIM; ++j) l[i] += pose[i * DIM + j] * x[j];
+            for (int j = 0; j < DIM; ++j) l[i] = fused((vec)(pose[i * DIM + j]), x[j], l[i]);
             at[i] = l[i] + shift[i];
         }
         int64_t next[LANES], last[LANES], most = 0;
@@ -102,38 +133,38 @@ GMM_INLINE void point_sums(const double* pose, const double* points, int64_t beg
             most = maximum(most, last[lane] - next[lane]);
         }
         for (; most > 0; --most) {
-            vec mean[DIM], normal[DIM], precision[DIM][DIM], is_there = (vec)(0.0);
+            vec surface[N_NUMBERS], precision[DIM][DIM], is_there = (vec)(0.0);
+            int64_t row[LANES];
             for (int lane = 0; lane < LANES; ++lane) {
                 const bool is_more = next[lane] < last[lane];
-                const int64_t k = is_more ? target.entries[next[lane]] : 0;
+                row[lane] = is_more ? target.entries[next[lane]] : 0;
                 set(is_there, lane, is_more ? 1.0 : 0.0);
                 next[lane] += is_more;
-                for (int i = 0; i < DIM; ++i) {
-                    set(mean[i], lane, target.means[k * DIM + i]);
-                    set(normal[i], lane, target.normals[k * DIM + i]);
-                    for (int j = i; j < DIM; ++j)
-                        set(precision[i][j], lane, target.precisions[(k * DIM + i) * DIM + j]);
-                }
             }
+            load_rows<N_NUMBERS>(target.surfaces, row, surface);
+            const vec *mean = surface, *normal = surface + DIM, *triangle = surface + 2 * DIM;
+            for (int i = 0; i < DIM; ++i)
+                for (int j = i; j < DIM; ++j) precision[i][j] = *triangle++;
             vec above = (vec)(0.0), square = (vec)(0.0), d[DIM], p[DIM];  // above: the sensor over the face
             for (int i = 0; i < DIM; ++i) {
-                above += normal[i] * (shift[i] - mean[i]);
+                above = fused(normal[i], shift[i] - mean[i], above);
                 d[i] = at[i] - mean[i];
             }
             for (int i = 0; i < DIM; ++i) {
                 p[i] = (vec)(0.0);
-                for (int j = 0; j < DIM; ++j) p[i] += precision[minimum(i, j)][maximum(i, j)] * d[j];
-                square += d[i] * p[i];
+                for (int j = 0; j < DIM; ++j)
+                    p[i] = fused(precision[minimum(i, j)][maximum(i, j)], d[j], p[i]);
+                square = fused(d[i], p[i], square);
             }
             vec height = expo(-0.5 * square) * is_there;
             height = above < -target.behind ? (vec)(0.0) : height;
             height = square > target.farthest ? (vec)(0.0) : height;
             total += height;
             for (int i = 0; i < DIM && DERIVES; ++i) {
-                pull[i] += height * p[i];
+                pull[i] = fused(height, p[i], pull[i]);
                 for (int j = i; j < DIM; ++j) {
-                    weight[i][j] += height * precision[i][j];
-                    spread[i][j] += height * p[i] * p[j];
+                    weight[i][j] = fused(height, precision[i][j], weight[i][j]);
+                    spread[i][j] = fused(height * p[i], p[j], spread[i][j]);
                 }
             }
         }
