@@ -36,7 +36,6 @@ NEVER = 1e4
 """Nats against a pose that is farther from the expected poses than the sensor moves."""
 _NEAR = 3  # cells from a surface: neither free nor unknown
 _LEVELS = 5  # the largest squares are 16 cells wide
-_BORDER = 96  # unknown cells around a raster: most points stay in it at all shifts
 _MOST_SQUARES = 150  # of one heading
 _TURNS = math.radians(0.7), math.radians(4)  # least and largest step between headings
 _FAR = 0.8  # quantile of the ranges that a step between headings moves by a cell
@@ -145,7 +144,6 @@ class PoseSearch:
             wide = torch.maximum(wide[:-step], wide[step:])
             levels.append(torch.maximum(wide[:, :-step], wide[:, step:]))
         self._levels = [_in_parts(one, 1 << level) for level, one in enumerate(levels)]
-        self._low -= _BORDER
 
     @classmethod
     def of_map(cls, components: Components, center: Tensor) -> PoseSearch:
@@ -168,7 +166,7 @@ class PoseSearch:
         size = self._levels[0].shape[2:]
         middle = self.cell * (self._low + torch.tensor(size).to(self._low) / 2)
         level = Pose(torch.eye(2).to(middle)[None], middle[None])
-        reach = self.cell * (max(size) - 2 * _BORDER) / math.sqrt(2)
+        reach = self.cell * max(size) / math.sqrt(2)
         unknown = Expectation(level, math.inf, math.inf, 1.0, reach)
         return self.best(points, unknown, most, _KEPT_ANYWHERE)
 
@@ -313,9 +311,7 @@ def _divided(heading: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _in_parts(raster: Tensor, width: int) -> Tensor:
-    """A raster with a border of unknown cells, as `raster_sums` takes it: neighbours in a part are `width`
-    cells apart."""
+    """A raster as `raster_sums` takes it: neighbours in a part are `width` cells apart."""
     more = [-size % width for size in raster.shape]
-    padding = _BORDER, _BORDER + more[1], _BORDER, _BORDER + more[0]
-    wide = torch.nn.functional.pad(raster, padding, value=UNKNOWN)
+    wide = torch.nn.functional.pad(raster, (0, more[1], 0, more[0]), value=UNKNOWN)
     return wide.unflatten(1, (-1, width)).unflatten(0, (-1, width)).permute(1, 3, 0, 2).contiguous()
