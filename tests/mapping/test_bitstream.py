@@ -40,14 +40,12 @@ def test_scaled_and_single_numbers_are_decoded(values, scales):
     for code, width in zip(codes, widths, strict=True):
         writer.one(code & ((1 << width) - 1), width)
     small = zigzag(np.array(values, np.int64)) % 1000
-    writer.rice_column(small)
+    writer.short(small)
     for value in values:
         writer.number(value)
     reader = BitReader(writer.to_bytes())
     assert reader.scaled(scale).tolist() == values
-    assert reader.rice_column(len(values)).tolist() == [
-        int(v) for v in zigzag(np.array(values, np.int64)) % 1000
-    ]
+    assert reader.short(len(values)).tolist() == [int(v) for v in zigzag(np.array(values, np.int64)) % 1000]
     assert [reader.number() for _ in values] == values
     reader.finish()
 

@@ -102,7 +102,7 @@ def _ids(writer: BitWriter, rng: Random, most: int = 12) -> int:
                 writer.fixed(np.ones(n - 1, np.int64), 1)
             else:
                 largest = rng.choice([1, 5, 300])
-                writer.rice_column(np.array([rng.randint(0, 5) for _ in range(n - 2)] + [largest], np.int64))
+                writer.short(np.array([rng.randint(0, 5) for _ in range(n - 2)] + [largest], np.int64))
         total += n
     return total
 

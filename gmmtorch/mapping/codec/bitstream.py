@@ -105,7 +105,7 @@ class BitWriter:
         return data
 
     def fixed(self, values: Ints, widths: Ints | int) -> None:
-        """Writes each number ≥ 0 in as many bits."""
+        """Writes each number ≥ 0 in `widths` bits, or each in its own."""
         for begin in range(0, len(values), _BLOCK):
             block = values[begin : begin + _BLOCK]
             if isinstance(widths, int):
@@ -165,7 +165,7 @@ class BitWriter:
         else:
             self.rice(zigzag(np.diff(values)) if code == _DIFFERENCES else values - base, parameter)
 
-    def rice_column(self, values: Ints) -> None:
+    def short(self, values: Ints) -> None:
         """Writes numbers ≥ 0 in a Rice or an exponential Golomb code, after its low bits: at least one bit
         for each number."""
         (low, n_bits), (other, n_other) = _rice_code(values), _golomb_code(values)
@@ -295,7 +295,7 @@ class BitReader:
             raise DataError("The sum of a column's differences is too large: it is damaged.")
         return steps.cumsum()[:n]
 
-    def rice_column(self, n: int) -> Ints:
+    def short(self, n: int) -> Ints:
         """Reads n numbers ≥ 0."""
         low = self.one(6)
         return self.golomb(n, self.one(6)) if low == _IS_GOLOMB else self.rice(n, low)

@@ -111,5 +111,5 @@ def _read_viewpoints(reader: BitReader, k: int, n_origins: int) -> tuple[Ints, I
     within(seen_from, "origins seen from", 0, n_origins - 1)
     several = np.repeat(n_viewpoints, n_viewpoints) > 1
     share = np.zeros(len(seen_from), np.int64)
-    share[several] = within(reader.rice_column(int(several.sum())), "shares", 0, LEAST_SHARE)
+    share[several] = within(reader.short(int(several.sum())), "shares", 0, LEAST_SHARE)
     return n_viewpoints, seen_from, share

@@ -185,7 +185,7 @@ def write_ids(writer: BitWriter, ids: Ints) -> None:
         writer.number(n)
         writer.number(int(numbers[0]))
         if n > 1:
-            writer.rice_column(np.diff(numbers) - 1)
+            writer.short(np.diff(numbers) - 1)
 
 
 def read_ids(reader: BitReader) -> Ints:
@@ -199,7 +199,7 @@ def read_ids(reader: BitReader) -> Ints:
         robot, n, first = reader.number(), reader.number(), reader.number()
         if not (last < robot <= LARGEST_NUMBER and n >= 1 and first >= 0):
             raise DataError(f"Robot {robot} after {last} with {n} ids from {first} on: it is damaged.")
-        gaps = reader.rice_column(n - 1) if n > 1 else np.zeros(0, np.int64)
+        gaps = reader.short(n - 1) if n > 1 else np.zeros(0, np.int64)
         about = first + n + float(gaps.astype(np.float64).sum())  # the exact sum could overflow
         if about > 2 * LARGEST_NUMBER or first + n - 1 + int(gaps.sum()) > LARGEST_NUMBER:
             raise DataError("Ids are out of range: it is damaged.")
