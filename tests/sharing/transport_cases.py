@@ -46,7 +46,7 @@ def hostile_frames(frame: bytes, sender: int) -> dict[str, list[bytes]]:
         "malformed": [frame[:30], b"\xf1"],
         "wrong_key": [
             frame[:-1],
-            frame[:-1] + b"?",
+            frame[:-1] + bytes([frame[-1] ^ 1]),
             Sealer(sender, TeamKey.generate()).seal(b"x"),
             Sealer(sender).seal(b"x"),
         ],
