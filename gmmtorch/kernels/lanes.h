@@ -90,6 +90,28 @@ GMM_INLINE int64_t get(Lanes::whole v, int i) { return v[i]; }
 GMM_INLINE void set(vec& v, int i, double x) { ((double*)&v)[i] = x; }
 GMM_INLINE void set(single& v, int i, float x) { ((float*)&v)[i] = x; }
 
+// Four numbers of the row of each lane.
+template <typename RowOf>
+GMM_INLINE void load_four(const double* rows, RowOf row_of, int width, vec* x) {
+    typedef double quad __attribute__((ext_vector_type(4)));
+    typedef double packed __attribute__((ext_vector_type(4), aligned(8)));
+    quad column[2][4];
+    for (int half = 0; half < 2; ++half) {  // the transpose of four rows
+        quad given[4];
+        for (int l = 0; l < 4; ++l) given[l] = *(const packed*)(rows + row_of(4 * half + l) * width);
+        const quad a = __builtin_shufflevector(given[0], given[1], 0, 4, 2, 6);
+        const quad b = __builtin_shufflevector(given[0], given[1], 1, 5, 3, 7);
+        const quad c = __builtin_shufflevector(given[2], given[3], 0, 4, 2, 6);
+        const quad d = __builtin_shufflevector(given[2], given[3], 1, 5, 3, 7);
+        column[half][0] = __builtin_shufflevector(a, c, 0, 1, 4, 5);
+        column[half][1] = __builtin_shufflevector(b, d, 0, 1, 4, 5);
+        column[half][2] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
+        column[half][3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
+    }
+    for (int i = 0; i < 4; ++i)
+        x[i] = __builtin_shufflevector(column[0][i], column[1][i], 0, 1, 2, 3, 4, 5, 6, 7);
+}
+
 GMM_INLINE double largest(vec v) {
     vec other = __builtin_shufflevector(v, v, 4, 5, 6, 7, 4, 5, 6, 7);
     v = v > other ? v : other;
@@ -113,6 +135,20 @@ GMM_INLINE vec expo(vec x) {
     return __builtin_bit_cast(vec, __builtin_bit_cast(mask, p) + power);
 }
 #endif
+
+// The row of each lane, of rows of WIDTH numbers.
+template <int WIDTH, typename Real, typename RowOf>
+GMM_INLINE void load_rows(const Real* rows, RowOf row_of, vec* x) {
+    int first = 0;
+#if defined(GMM_VECTORS)
+    if constexpr (sizeof(Real) == sizeof(double))
+        for (; first + 4 <= WIDTH; first += 4) load_four(rows + first, row_of, WIDTH, x + first);
+#endif
+    for (int l = 0; l < LANES; ++l) {
+        const Real* given = rows + row_of(l) * WIDTH;
+        for (int n = first; n < WIDTH; ++n) set(x[n], l, (double)given[n]);
+    }
+}
 
 // Natural logarithm of normal numbers above 0; error below 3e-16 (1 + |log x|).
 GMM_INLINE vec logarithm(vec x) {

@@ -7,15 +7,6 @@ namespace gmm {
 
 constexpr double SKIPPED = 37.0;  // nats below a row's largest term: K e^-37 is below 1e-12 of it
 
-// Features of one row in each lane.
-template <int WIDTH, typename Real, typename RowOf>
-GMM_INLINE void load_rows(const Real* features, RowOf row_of, vec* x) {
-    for (int l = 0; l < LANES; ++l) {
-        const Real* given = features + row_of(l) * WIDTH;
-        for (int f = 0; f < WIDTH; ++f) set(x[f], l, (double)given[f]);
-    }
-}
-
 // Calls use(n, a, b, c, d) with the logits of four components from the n-th on, for features x; of(n) gives
 // the natural parameters of the n-th component. What four components share is loaded once.
 template <int WIDTH, typename Of, typename Use>

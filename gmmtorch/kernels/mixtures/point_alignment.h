@@ -65,34 +65,6 @@ GMM_KERNEL box_lists(int64_t item, Team team, const int64_t* first, const int64_
 // number of quadruples.
 CUDA_CALLABLE constexpr int n_of_surface(int dim) { return (2 * dim + dim * (dim + 1) / 2 + 3) / 4 * 4; }
 
-// The numbers of the row of each lane, where N is a multiple of four.
-template <int N>
-GMM_INLINE void load_rows(const double* rows, const int64_t* row, vec* numbers) {
-#if defined(GMM_VECTORS)
-    typedef double quad __attribute__((ext_vector_type(4)));
-    typedef double packed __attribute__((ext_vector_type(4), aligned(8)));
-    for (int n = 0; n < N; n += 4) {
-        quad column[2][4];
-        for (int half = 0; half < 2; ++half) {  // the transpose of four rows
-            quad given[4];
-            for (int l = 0; l < 4; ++l) given[l] = *(const packed*)(rows + row[4 * half + l] * N + n);
-            const quad a = __builtin_shufflevector(given[0], given[1], 0, 4, 2, 6);
-            const quad b = __builtin_shufflevector(given[0], given[1], 1, 5, 3, 7);
-            const quad c = __builtin_shufflevector(given[2], given[3], 0, 4, 2, 6);
-            const quad d = __builtin_shufflevector(given[2], given[3], 1, 5, 3, 7);
-            column[half][0] = __builtin_shufflevector(a, c, 0, 1, 4, 5);
-            column[half][1] = __builtin_shufflevector(b, d, 0, 1, 4, 5);
-            column[half][2] = __builtin_shufflevector(a, c, 2, 3, 6, 7);
-            column[half][3] = __builtin_shufflevector(b, d, 2, 3, 6, 7);
-        }
-        for (int i = 0; i < 4; ++i)
-            numbers[n + i] = __builtin_shufflevector(column[0][i], column[1][i], 0, 1, 2, 3, 4, 5, 6, 7);
-    }
-#else
-    for (int n = 0; n < N; ++n) numbers[n] = rows[row[0] * N + n];
-#endif
-}
-
 CUDA_CALLABLE constexpr int n_alignment_sums(int dim) { return 2 + n_free(dim) * (n_free(dim) + 2); }
 
 // Sums over the points begin … stop - 1 under one motion: log(1 + q/outliers), whether q is above the height
@@ -141,7 +113,7 @@ GMM_INLINE void point_sums(const double* pose, const double* points, int64_t beg
                 set(is_there, lane, is_more ? 1.0 : 0.0);
                 next[lane] += is_more;
             }
-            load_rows<N_NUMBERS>(target.surfaces, row, surface);
+            load_rows<N_NUMBERS>(target.surfaces, [&](int l) { return row[l]; }, surface);
             const vec *mean = surface, *normal = surface + DIM, *triangle = surface + 2 * DIM;
             for (int i = 0; i < DIM; ++i)
                 for (int j = i; j < DIM; ++j) precision[i][j] = *triangle++;
